@@ -14,6 +14,7 @@ from duagc.pipeline.recording import RECORDING_FILE, Recording, read_log
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.session_file import NAME as SESSION
 from duagc.pipeline.runs.timing import Timing, label
+from duagc.pipeline.watch import UNWATCHED, Watch
 from duagc.schemas import topics
 
 
@@ -28,15 +29,19 @@ class Prepared:
 class Chain:
     """The stages of a run in their order, each with what it is computed from."""
 
-    def __init__(self, recording: Recording, carrier: Carrier, digests: FileDigests) -> None:
+    def __init__(
+        self, recording: Recording, carrier: Carrier, digests: FileDigests, watch: Watch = UNWATCHED
+    ) -> None:
         """Set up.
 
         Args:
             recording: that the run is of.
             carrier: does the stages.
             digests: of the files of the recording.
+            watch: hears of the steps of the stages, and changes nothing.
         """
         self._recording, self._carrier, self._digests = recording, carrier, digests
+        self._watch = watch
 
     def calibration(self, workers: int) -> Carried:
         """The recording with its cameras calibrated, if that is better; no file, if it is not.
@@ -70,7 +75,8 @@ class Chain:
             size = steps.check_log(log, robot)
             folder.mkdir(parents=True, exist_ok=True)
             settings = carrier.settings_of(stages.FRONTEND)
-            checkpoints = carrier.checkpoints(carrier.key(stages.FRONTEND, robot, inputs))
+            report = self._watch.frontend(robot, self._recording.robots.index(robot))
+            checkpoints = carrier.checkpoints(carrier.key(stages.FRONTEND, robot, inputs), report)
             with timing.stage(stages.FRONTEND, folder, robot):
                 parts = steps.frontend(log, folder, settings, threads=threads, checkpoints=checkpoints)
             timing.went_on(label("frontend", robot), *checkpoints.before_s)
@@ -112,7 +118,7 @@ class Chain:
         def meet(timing: Timing) -> None:
             settings = carrier.settings_of(stages.EXCHANGE)
             with timing.stage(stages.EXCHANGE, carrier.folder):
-                steps.exchange(logs, carrier.folder, settings)
+                steps.exchange(logs, carrier.folder, settings, watch=self._watch.round)
 
         inputs: dict[str, str] = {}
         for name, robot in sorted(prepared.items()):

@@ -8,7 +8,8 @@ from pathlib import Path
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cache.carrier import intact, words
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.job import READERS, Job, Say, stages_of
+from duagc.pipeline.job import READERS, Job
+from duagc.pipeline.preparation import Say, stages_of
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import NAMES, RunPlan
 from duagc.pipeline.runs import stages

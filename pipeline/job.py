@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -16,26 +15,24 @@ from typing import Any
 from duagc import __version__
 from duagc.pipeline import steps
 from duagc.pipeline.base.component_names import robot_of
-from duagc.pipeline.base.machine import memory_bytes
-from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError
 from duagc.pipeline.cache.file_digests import FileDigests
-from duagc.pipeline.cache.footprint import fitting, robot_bytes
 from duagc.pipeline.cache.stage_key import StageKey
-from duagc.pipeline.cache.store import Store
 from duagc.pipeline.chain import Chain, Prepared
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.preparation import Preparation, Say, carrier_of, workers_that_fit
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
 from duagc.pipeline.runs.folder import SCHEMA
 from duagc.pipeline.steps import threads_per_worker
+from duagc.pipeline.time_left import EVERY_S, TimeLeft
+from duagc.pipeline.watch import UNWATCHED, Watch, ticking
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 READER_SHARE = 2.0  # memory of the evaluation of a robot, relative to its preparation
-MEASURED = 20  # results of front ends that memory is estimated from
 READERS = (stages.EVALUATION.name, stages.REPORT.name, stages.VIEW.name)
 TITLES = {
     stages.CALIBRATION.name: "calibration",
@@ -46,12 +43,6 @@ TITLES = {
     stages.VIEW.name: "view",
 }
 """Stages that this process does, as they are announced."""
-Say = Callable[[str], None]
-
-
-def say(line: str) -> None:
-    """Say something on standard error."""
-    print(line, file=sys.stderr, flush=True)
 
 
 class Job:
@@ -80,30 +71,42 @@ class Job:
             looking: only look what is there: nothing is computed or written.
         """
         self.recording, self.folder, self.config, self.plan, self.log = recording, folder, config, plan, log
-        self.store = None if plan.store is None else Store(plan.store)
-        self.digests = FileDigests(None) if self.store is None else self.store.files
-        self.carrier = Carrier(
-            folder,
-            config,
-            self.store,
-            log,
-            again=plan.again,
-            looking=looking,
-            earlier={} if self.store is None else stages_of(place),
-            place=place,
-            begun=self._announce,
+        self.carrier = carrier_of(
+            folder, config, plan, log=log, place=place, looking=looking, begun=self._announce
         )
+        self.store = self.carrier.store
+        self.digests = FileDigests(None) if self.store is None else self.store.files
         self.missing: list[StageKey] = []
         self._calibration: dict[str, Any] = {}
         self._before: list[Carried] = []
         self._place = place
+        self._watch, self._where = UNWATCHED, None  # type: Watch, Any
+        self._time_left: TimeLeft | None = None
 
     def run(self) -> None:
-        """Do everything.
+        """Do everything; now and then say how far it is.
 
         Raises:
             DuagError: what a user can fix.
         """
+        if self.plan.follow:
+            from duagc.pipeline.viewing.follow import Follower
+
+            follower, self._where = Follower.serving(self.recording)
+            self._watch = Watch(follower=follower)
+            self.log(f"follow the run with: rerun {self._where[0]}")
+        try:
+            with ticking(self._say_time_left, EVERY_S):
+                self._run()
+        finally:
+            if self._watch.follower is not None:
+                self._watch.follower.close()
+
+    def _say_time_left(self) -> None:
+        if self._time_left is not None:
+            self.log(self._time_left.line())
+
+    def _run(self) -> None:
         if self.plan.has(stages.EVALUATION) and (self.plan.calibrate or not self._is_stored()):
             from duagc.pipeline.evaluation import check_ground_truth
 
@@ -147,7 +150,7 @@ class Job:
             NotStoredError: one would have to be computed while only looking; `missing` has those that are known.
             DuagError: as the stages.
         """
-        plan, chain = self.plan, Chain(self.recording, self.carrier, self.digests)
+        plan, chain = self.plan, Chain(self.recording, self.carrier, self.digests, self._watch)
         prepared = self._prepared(chain)
         own = [c for robot in prepared.values() for c in (robot.frontend, robot.information) if c is not None]
         done = list({c.label: c for c in own}.values())
@@ -157,7 +160,9 @@ class Job:
         if plan.has(stages.FUSION):
             done += self._fused(chain, prepared, exchange)
         self._write(done)
-        workers = cache(lambda: self._fitting(self.recording.robots, READER_SHARE))
+        if self._watch.follower is not None and plan.has(stages.FUSION):
+            self._watch.follower.finished(self.folder, self.recording.path)
+        workers = cache(lambda: self._fitting(self._sizes(self.recording.robots), READER_SHARE))
         cameras = self._calibration.get("calibration", {}).get("cameras")
         notes = {"calibration": _digest_of(cameras)} if cameras else {}
         if plan.has(stages.EVALUATION):
@@ -190,6 +195,8 @@ class Job:
 
     def _announce(self, key: StageKey, stored: bool) -> None:
         """Say that a stage begins, and why where an earlier result of it is there."""
+        if self._time_left is not None and not stored:
+            self._time_left.begin(key.stage)
         title = TITLES.get(key.stage)
         if title is None:
             return
@@ -237,49 +244,37 @@ class Job:
         for robot in set(self.recording.robots) - set(absent):
             found |= chain.robot(robot, threads=threads_per_worker(1), alone=alone)
         if absent:
-            workers = self._fitting(absent)
+            sizes = self._sizes(absent)
+            workers = self._fitting(sizes)
             self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
-            found |= self._prepared_in_workers(absent, workers, alone)
+            self._time_left = times = self._expected(sizes, found, workers)
+            preparation = Preparation(
+                self.recording.path, self.folder, self.config, self.plan, self._place, self._where
+            )
+            found |= preparation.run(absent, workers, alone=alone, hear=lambda step: times.step(*step))
         else:
             self.log(f"front end and information: {len(found)} robots from the store")
+            self._time_left = self._expected({}, found, self.plan.workers)
         for name in sorted(set(found) - set(self.recording.robots)):
             self.log(
                 f"warning: {name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
             )
         return dict(sorted(found.items()))
 
-    def _fitting(self, robots: Sequence[str], share: float = 1.0) -> int:
-        """How many of some robots are looked at at the same time, so that they fit into memory.
+    def _expected(
+        self, sizes: dict[str, dict[str, int]], found: dict[str, Prepared], workers: int
+    ) -> TimeLeft:
+        """What the run will take: `sizes` of the logs whose robots are to be prepared; the others were found."""
+        known = {name: robot.frontend.entry.result for name, robot in found.items()}
+        wanted = [stage for stage in stages.STAGES if self.plan.has(stage)]
+        mapping = self.config.frontend.mapping
+        return TimeLeft(sizes, mapping, found=known, workers=workers, wanted=wanted)
 
-        share: of memory, relative to the preparation of a robot.
-        """
-        asked = min(self.plan.workers, len(robots))
-        if asked == 1:
-            return 1
-        measured = [] if self.store is None else self.store.recent(stages.FRONTEND.name, MEASURED)
-        sizes = [steps.check_log(self.recording.log(robot), robot) for robot in robots]
-        needed = [share * robot_bytes(size, measured) for size in sizes]
-        _, free = memory_bytes()
-        workers = fitting(asked, needed, free)
-        if workers < asked and free is not None:
-            self.log(
-                f"{workers} at a time instead of {asked}: a robot may take {max(needed) / 1e9:.1f} GB of memory, "
-                f"found {free / 1e9:.1f} GB free"
-            )
-        return workers
+    def _fitting(self, sizes: dict[str, dict[str, int]], share: float = 1.0) -> int:
+        return workers_that_fit(list(sizes.values()), self.carrier, self.plan.workers, share=share)
 
-    def _prepared_in_workers(self, robots: list[str], workers: int, alone: bool) -> dict[str, Prepared]:
-        threads = threads_per_worker(workers)
-        found: dict[str, Prepared] = {}
-        with worker_pool(workers) as pool:
-            job = self.recording.path, self.folder, self.config, self.plan
-            tasks = [
-                pool.submit(_prepare, *job, robot=robot, place=self._place, threads=threads, alone=alone)
-                for robot in robots
-            ]
-            for task in tasks:
-                found |= task.result()
-        return found
+    def _sizes(self, robots: Sequence[str]) -> dict[str, dict[str, int]]:
+        return {robot: steps.check_log(self.recording.log(robot), robot) for robot in robots}
 
     def _looking_carrier(self) -> Carrier:
         return replace(self.carrier, looking=True)
@@ -344,36 +339,6 @@ def _row(carried: Carried) -> dict[str, Any]:
     return {"key": entry.key.digest, "inputs": dict(entry.key.inputs)} | {
         name: plain[name] for name in ("files", "result", "timing")
     }
-
-
-def stages_of(run: Path) -> dict[str, Any]:
-    """What the manifest of a run says of its stages; empty if there is none, or none that says it.
-
-    Args:
-        run: folder of the run.
-    """
-    try:
-        content = json.loads((run / "manifest.json").read_bytes())
-        rows = content["stages"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    return rows if isinstance(rows, dict) else {}
-
-
-def _prepare(
-    recording: Path,
-    folder: Path,
-    config: RunConfig,
-    plan: RunPlan,
-    *,
-    robot: str,
-    place: Path,
-    threads: int,
-    alone: bool,
-) -> dict[str, Prepared]:
-    """One robot, in a process of its own."""
-    job = Job(Recording(recording), folder, config, plan, log=lambda line: say(f"duagc: {line}"), place=place)
-    return Chain(job.recording, job.carrier, job.digests).robot(robot, threads=threads, alone=alone)
 
 
 def _digest_of(value: Any) -> str:

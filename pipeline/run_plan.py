@@ -25,6 +25,7 @@ class RunPlan:
         since: the first stage that is computed whatever the store has; None: none is.
         until: the last stage that is done.
         evaluated: whether the run is measured, and gets a report.
+        follow: serve the run to Rerun while it is computed.
     """
 
     workers: int = 2
@@ -34,6 +35,7 @@ class RunPlan:
     since: str | None = None
     until: str = LAST
     evaluated: bool = True
+    follow: bool = False
 
     def __post_init__(self) -> None:
         for option, name in (("--from", self.since), ("--until", self.until)):

@@ -18,7 +18,8 @@ from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.existing_run import is_up_to_date
-from duagc.pipeline.job import Job, Say, say
+from duagc.pipeline.job import Job
+from duagc.pipeline.preparation import Say, say
 from duagc.pipeline.run_plan import LAST, RunPlan
 
 
@@ -34,6 +35,7 @@ def run(
     since: str | None = None,
     until: str = LAST,
     evaluated: bool = True,
+    follow: bool = False,
     log: Say = say,
 ) -> None:
     """Run all stages on a recording.
@@ -55,12 +57,15 @@ def run(
         since: the first stage that is computed whatever the store has; None: none is.
         until: the last stage that is done.
         evaluated: whether the run is measured, and gets a report.
+        follow: serve the run to Rerun while it is computed; changes no bit of the result.
         log: gets a line at the start of every stage, and every warning.
 
     Raises:
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
-    plan = RunPlan(workers, force, calibrate, store=store, since=since, until=until, evaluated=evaluated)
+    plan = RunPlan(
+        workers, force, calibrate, store=store, since=since, until=until, evaluated=evaluated, follow=follow
+    )
     determinism.configure_determinism()
     if determinism.is_deterministic():
         _run(recording_path, out, config, plan, log=log)

@@ -17,6 +17,7 @@ from duagc.pipeline.base.errors import DuagError
 if TYPE_CHECKING:
     from duagc.pipeline.base.checkpoints import Checkpoints
     from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.exchange.session import RoundWatch
     from duagc.pipeline.recording import Recording
     from duagc.pipeline.runs.robot_data import AgentInput, SessionResult
 
@@ -60,7 +61,7 @@ def check_log(log: Path, robot: str) -> dict[str, int]:
         robot: whose it should be.
 
     Returns:
-        Its frames, and the pixels of an image.
+        Its frames, the pixels of an image, and whether depth is of other times than color.
 
     Raises:
         DuagError: the log is damaged, or another robot's.
@@ -71,7 +72,11 @@ def check_log(log: Path, robot: str) -> dict[str, int]:
     with open_rgbd(log) as camera:
         if camera.robot != robot:
             raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
-        return {"frames": len(camera), "pixels": camera.camera.width * camera.camera.height}
+        return {
+            "frames": len(camera),
+            "pixels": camera.camera.width * camera.camera.height,
+            "moved": int(camera.pairing.largest_offset_ns > 0),
+        }
 
 
 def frontend(
@@ -98,7 +103,6 @@ def frontend(
         config.frontend,
         seed=config.seed,
         threads=threads,
-        progress=True,
         checkpoints=checkpoints,
     )
 
@@ -151,13 +155,16 @@ def agent_input(robot: str, log: Path, folder: Path, config: RunConfig) -> Agent
     return AgentInput(robot, log, *files, thickness_floor_m=thickness_m)
 
 
-def exchange(logs: dict[str, Path], folder: Path, config: RunConfig) -> None:
+def exchange(
+    logs: dict[str, Path], folder: Path, config: RunConfig, *, watch: RoundWatch | None = None
+) -> None:
     """Let the team meet.
 
     Args:
         logs: of the robots' sensors, by name of the component.
         folder: of the run; gets exchange.mcap, consensus.mcap, and what each robot takes home.
         config: of the run.
+        watch: hears of every round, and changes nothing.
     """
     from duagc.pipeline.exchange.session import run_session
     from duagc.pipeline.runs.session_file import NAME, write_session_result
@@ -170,6 +177,7 @@ def exchange(logs: dict[str, Path], folder: Path, config: RunConfig) -> None:
         seed=config.seed,
         exchange_path=folder / "exchange.mcap",
         consensus_path=folder / "consensus.mcap",
+        watch=watch,
     )
     for robot, result in results.items():
         write_session_result(folder / "robots" / robot / NAME, result)

@@ -166,21 +166,32 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
     (
         _part("doctor", "what a machine has", "base kernels"),
         _part("run_plan", "how a run is carried out", "base runs"),
+        _part("watch", "hears of a run at work", "base viewing"),
+        _part("time_left", "how long a run still takes", "base config runs cache"),
     ),
-    (_part("chain", "the stages in their order", "base schemas recording runs cache steps"),),
+    (_part("chain", "the stages in their order", "base schemas recording runs cache steps watch"),),
+    (
+        _part(
+            "preparation",
+            "robots in processes of their own",
+            "base config runs recording cache steps watch chain run_plan",
+        ),
+    ),
     (
         _part(
             "job",
             "a run that is made",
-            "base config runs recording evaluation cache steps chain run_plan",
+            "base config runs recording evaluation viewing cache steps watch time_left chain preparation run_plan",
         ),
     ),
     (
         _part(
-            "existing_run", "whether an earlier run stands", "base config runs recording cache job run_plan"
+            "existing_run",
+            "whether an earlier run stands",
+            "base config runs recording cache job run_plan preparation",
         ),
     ),
-    (_part("runner", "carries a run", "base config recording job run_plan existing_run"),),
+    (_part("runner", "carries a run", "base config recording job run_plan preparation existing_run"),),
     (
         _part(
             "batch",

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.base.saved_state import DamagedStateError, StateFile, write_state
@@ -26,8 +26,24 @@ LARGEST_SHARE = 0.02
 """Of the time that checkpoints may take; where one takes so long, the next one comes later."""
 WORTH_S = 1.0
 """A part that took less is computed again rather than saved."""
+Shown = Callable[[], Any]
+"""Gives what can be shown of a part while it is computed."""
 Value = TypeVar("Value")
 Item = TypeVar("Item")
+
+
+class StepReport(Protocol):
+    """Hears of every step, and changes nothing."""
+
+    def __call__(self, part: str, done: int, total: int, shown: Shown | None) -> None:
+        """Hear of one.
+
+        Args:
+            part: its name.
+            done: steps.
+            total: steps.
+            shown: gives what can be shown; None: nothing can.
+        """
 
 
 class Checkpoints:
@@ -40,7 +56,7 @@ class Checkpoints:
         say: Callable[[str], None] = lambda line: None,
         every_s: float = EVERY_S,
         largest_share: float = LARGEST_SHARE,
-        report: Callable[[str, int, int], None] = lambda part, done, total: None,
+        report: StepReport | None = None,
     ) -> None:
         """Set up.
 
@@ -49,7 +65,8 @@ class Checkpoints:
             say: gets a line where the computation goes on, and where a state is damaged or cannot be saved.
             every_s: time between two checkpoints.
             largest_share: of the time that checkpoints may take.
-            report: called after every step with the name of the part, steps done, and steps in all.
+            report: called after every step with the name of the part, steps done, steps in all, and what can be
+                shown.
         """
         self._folder, self._say, self._report = folder, say, report
         self._every_s, self._largest_share = every_s, largest_share
@@ -106,7 +123,27 @@ class Checkpoints:
         self._say(f"{name}: goes on at {done}/{total}")
         return done, state
 
-    def at(self, name: str, done: int, total: int, state: Callable[[], Any]) -> None:
+    def tell(self, name: str, done: int, total: int, shown: Shown | None = None) -> None:
+        """Say where a part is that is too short to be saved.
+
+        Args:
+            name: of the part.
+            done: steps.
+            total: steps.
+            shown: gives what can be shown of it.
+        """
+        if self._report is not None:
+            self._report(name, done, total, shown)
+
+    def at(
+        self,
+        name: str,
+        done: int,
+        total: int,
+        state: Callable[[], Any],
+        *,
+        shown: Shown | None = None,
+    ) -> None:
         """Say where a part is, after a step of it; saved if that is due.
 
         Args:
@@ -114,8 +151,9 @@ class Checkpoints:
             done: steps.
             total: steps.
             state: from which the part can go on; asked for only if it is saved.
+            shown: gives what can be shown of it.
         """
-        self._report(name, done, total)
+        self.tell(name, done, total, shown)
         since_s = time.perf_counter() - self._saved_s
         if since_s >= max(self._every_s, self._last_cost_s / self._largest_share):
             self._write(f"{name}.state", (state(), done, total))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,3 +24,14 @@ def memory_bytes() -> tuple[int | None, int | None]:
             if most < min(total or _UNLIMITED, _UNLIMITED):
                 total, free = most, min(most - now, free if free is not None else most)
     return total, free
+
+
+def cores() -> int:
+    """Cores that this process may use; the threads of one core count once."""
+    usable = os.sched_getaffinity(0)
+    siblings = set()
+    for processor in usable:
+        with suppress(OSError):
+            topology = Path(f"/sys/devices/system/cpu/cpu{processor}/topology")
+            siblings.add((topology / "thread_siblings_list").read_text().strip())
+    return len(siblings) or len(usable)

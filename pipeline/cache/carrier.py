@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-from duagc.pipeline.base.checkpoints import Checkpoints
+from duagc.pipeline.base.checkpoints import Checkpoints, StepReport
 from duagc.pipeline.cache.file_digests import FileDigest, FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import DamagedEntryError, Store, StoredResults
@@ -145,9 +145,7 @@ class Carrier:
                 self.store.forget_checkpoints(key)
             return Carried(entry, True)
 
-    def checkpoints(
-        self, key: StageKey, report: Callable[[str, int, int], None] = lambda part, done, total: None
-    ) -> Checkpoints:
+    def checkpoints(self, key: StageKey, report: StepReport | None = None) -> Checkpoints:
         """Where a stage saves how far it is, and from where it goes on.
 
         Args:

@@ -8,8 +8,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from duagc.pipeline.cache import durations
 from duagc.pipeline.cache.store import Store, StoredResults
-from duagc.pipeline.checks import estimate
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs.declared_settings import DeclaredSettings
 from duagc.pipeline.runs.stages import EVALUATION, FRONTEND, FUSION, Stage
@@ -43,7 +43,7 @@ def speed_of(store: Path) -> MachineSpeed:
     sizes = {entry.key.inputs["log"]: entry.result for entry in fronts if entry.result}
     measured = {
         FRONTEND.name: [
-            entry.timing["cpu_s"] / estimate.front_end_s(entry.result) for entry in fronts if entry.result
+            entry.timing["cpu_s"] / durations.front_end_s(entry.result) for entry in fronts if entry.result
         ],
         FUSION.name: list(_fusions(opened, sizes)),
         EVALUATION.name: list(_evaluations(opened, sizes)),
@@ -59,14 +59,14 @@ def _fusions(store: Store, sizes: Mapping[str, Mapping[str, Any]]) -> Iterator[f
     for entry in store.recent(FUSION.name, LAST):
         size = sizes.get(entry.key.inputs["log"])
         if size is not None and entry.result["robots"] > 1 and _is_default(entry, FUSION):
-            yield entry.timing["cpu_s"] / estimate.fusion_s(size)
+            yield entry.timing["cpu_s"] / durations.fusion_s(size)
 
 
 def _evaluations(store: Store, sizes: Mapping[str, Mapping[str, Any]]) -> Iterator[float]:
     """Of recordings whose logs are known by their size."""
     for entry in store.recent(EVALUATION.name, LAST):
         logs = {digest for digest in entry.key.inputs.values() if digest in sizes}
-        predicted = estimate.evaluation_s([sizes[digest] for digest in logs])
+        predicted = sum(durations.evaluation_s(sizes[digest]) for digest in logs)
         robots = {name.split("/")[1] for name in entry.key.inputs if name.startswith("robots/")}
         if len(logs) == len(robots) and predicted and _is_default(entry, EVALUATION):
             yield entry.timing["cpu_s"] / predicted

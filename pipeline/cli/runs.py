@@ -93,6 +93,10 @@ def run(
     no_evaluation: Annotated[
         bool, typer.Option("--no-evaluation", help="Leave out metrics and report.")
     ] = False,
+    follow: Annotated[
+        bool,
+        typer.Option("--follow", help="Serve the run to Rerun on port 9876 while it is computed."),
+    ] = False,
     force: Force = False,
 ) -> None:
     """Run all stages on a recording: maps, information, exchange, fusion, metrics, report, view.
@@ -137,6 +141,7 @@ def run(
         since=since,
         until=until,
         evaluated=not no_evaluation,
+        follow=follow,
         log=say,
     )
     _say_times(out)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from duagc.pipeline.base import determinism
@@ -29,6 +30,7 @@ def run_session(
     seed: int,
     exchange_path: Path,
     consensus_path: Path,
+    watch: RoundWatch | None = None,
 ) -> dict[str, SessionResult]:
     """Let the team meet.
 
@@ -38,20 +40,35 @@ def run_session(
         seed: of this run.
         exchange_path: log of messages and packets to write.
         consensus_path: log of rounds and loop closures to write.
+        watch: hears of every round, and changes nothing.
     Returns:
         The result of every robot, by name.
     Raises:
         DuagError: a file that an agent needs is missing or broken, or the team is too large.
     """
     data = [load(i) for i in sorted(inputs, key=lambda i: i.robot)]
-    return run_session_of(data, config, seed=seed, exchange_path=exchange_path, consensus_path=consensus_path)
+    return run_session_of(
+        data,
+        config,
+        seed=seed,
+        exchange_path=exchange_path,
+        consensus_path=consensus_path,
+        watch=watch,
+    )
+
+
+RoundWatch = Callable[[int, Mapping[str, int]], None]
+"""Hears of every round what was sent: its number, and counts of packets, dropped packets and bytes."""
 
 
 class _Recorder:
     """Both logs of a session, as rounds go by."""
 
-    def __init__(self, exchange: ExchangeRecorder, consensus: ConsensusRecorder) -> None:
-        self.exchange, self.consensus = exchange, consensus
+    def __init__(
+        self, exchange: ExchangeRecorder, consensus: ConsensusRecorder, watch: RoundWatch | None
+    ) -> None:
+        self.exchange, self.consensus, self.watch = exchange, consensus, watch
+        self._counts = Counter[str]()
 
     def ticked(self, agent: MapAgent, round_index: int, now_ns: int) -> None:
         """Record where the agent stands."""
@@ -60,9 +77,14 @@ class _Recorder:
     def sent(self, sender: str, out: Outgoing, fate: Fate, *, round_index: int, now_ns: int) -> None:
         """Record a packet."""
         self.exchange.packet(sender, out, round_index=round_index, send_ns=now_ns, fate=fate)
+        self._counts += Counter(packets=1, dropped=int(not fate.delivered), bytes=len(out.packet))
 
     def ended(self, round_index: int) -> None:
-        """Nothing is recorded of a round as a whole."""
+        """Nothing is recorded of a round as a whole; who watches hears of it."""
+        if self.watch is not None:
+            names = ("packets", "dropped", "bytes")
+            self.watch(round_index, {name: self._counts[name] for name in names})
+        self._counts.clear()
 
 
 def run_session_of(
@@ -72,6 +94,7 @@ def run_session_of(
     seed: int,
     exchange_path: Path,
     consensus_path: Path,
+    watch: RoundWatch | None = None,
 ) -> dict[str, SessionResult]:
     """`run_session` on data in memory, one entry per robot."""
     determinism.configure_opencv()
@@ -85,7 +108,7 @@ def run_session_of(
         count = run_rounds(
             agents,
             LinkModel(config.link, seed),
-            _Recorder(packets, rounds),
+            _Recorder(packets, rounds, watch),
             period_ns=config.period_ns,
             max_rounds=config.max_rounds,
             title="exchange",

@@ -113,7 +113,13 @@ class MapBuilder:
         for keyframe in progress_bar.track(left, f"mapping {self.name}") if self._progress else left:
             stats = self._with_images(self._mapper.add_keyframe, keyframe)
             updates.append(self._update(keyframe, stats))
-            self._checkpoints.at(part, len(updates), len(keyframes), lambda: (updates, self._mapper.state()))
+            self._checkpoints.at(
+                part,
+                len(updates),
+                len(keyframes),
+                lambda: (updates, self._mapper.state()),
+                shown=lambda: self._mapper.gaussians,
+            )
         return updates, self._mapper.state()
 
     def _restore(self, keyframes: Sequence[Keyframe], state: Any) -> None:

@@ -271,7 +271,7 @@ class Mapper:
             pose_step = poses.of(chosen, config.pose_rate * share) if refined and chosen else None
             self._optimize(views[chosen], 0, config.rates.times(share), pose_step=pose_step)
             state = partial(self._optimized, (before, inserted, pruned), poses)
-            checkpoints.at(part, step + 1, steps, state)
+            checkpoints.at(part, step + 1, steps, state, shown=lambda: self.gaussians)
         pruned += self._map.prune_degenerate()
         return MappingStats(inserted, pruned, len(self._map), before, self._mean_loss())
 

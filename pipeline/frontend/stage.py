@@ -101,6 +101,8 @@ def run_frontend(
                 f"{log_path}: found no frame of {size} pixels to begin a map with ({reasons}), "
                 "expected one with depth in enough of them"
             )
+        keyframes = sum(len(submap.keyframes) for submap in tracked.submaps)
+        save.tell("keyframes", keyframes, keyframes)
         noise_m = depth_noise_m(tracked.frames)
         clock.lap("tracking_s")
         components = save.done(
@@ -194,7 +196,7 @@ class _Tracking:
             left = progress_bar.track(left, f"{part} {log.robot}", len(log) - begin)
         for index in left:
             tracker.track(RgbdImages.of(log.frame(index)))
-            save.at(part, index + 1, len(log), tracker.state)
+            save.at(part, index + 1, len(log), tracker.state, shown=tracker.path)
         return tracker.finish()
 
 

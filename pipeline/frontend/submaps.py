@@ -22,6 +22,7 @@ from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyfram
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.tracking_state import CurrentFrame
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import MotionPrior
 from duagc.pipeline.registration.features import matches
@@ -109,6 +110,18 @@ class SubmapTracker:
             state: of that one.
         """
         self._trackers, self._current, self._candidate, self._frames, self._submap_of = state
+
+    def path(self) -> Trajectory:
+        """T_submap_camera of the frames of the current submap so far."""
+        keyframes = self._trackers[self._current].keyframes
+        placed = [
+            frame
+            for frame, submap in zip(self._frames, self._submap_of, strict=True)
+            if submap == self._current and frame.status is not Status.LOST
+        ]
+        poses = [keyframes[f.keyframe_index].T_map_keyframe @ f.T_keyframe_camera for f in placed]
+        stamps = np.array([frame.stamp_ns for frame in placed], dtype=np.int64)
+        return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))
 
     def track(self, images: RgbdImages) -> None:
         """Track one frame.

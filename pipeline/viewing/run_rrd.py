@@ -48,7 +48,7 @@ def write_rrd(run_dir: Path, recording: Path, out: Path, max_gaussians: int = 30
     stream = rr.RecordingStream(APPLICATION, recording_id=f"run-{source.name}")
     with new_file(out) as part:
         stream.save(part, default_blueprint=_blueprint(run))
-        _log_run(stream, run, source, max_gaussians)
+        log_run(stream, run, source, max_gaussians)
         stream.flush()
         stream.disconnect()
     return out
@@ -61,7 +61,15 @@ def _world_of(run: RunFolder, component: Sequence[str]) -> str:
     )
 
 
-def _log_run(stream: rr.RecordingStream, run: RunFolder, source: Recording, max_gaussians: int) -> None:
+def log_run(stream: rr.RecordingStream, run: RunFolder, source: Recording, max_gaussians: int) -> None:
+    """Log a run.
+
+    Args:
+        stream: gets it.
+        run: finished but for its metrics.
+        source: its recording.
+        max_gaussians: of each map.
+    """
     import rerun as rr
 
     names, session = list(run.robots), Session(run)
@@ -87,12 +95,17 @@ def _log_path(stream: rr.RecordingStream, entity: str, way: Path3, index: int) -
     parts = [("before_consensus", way.before, color + "66"), ("after_consensus", way.after, color + "ff")]
     if not isinstance(way.true, Absent):
         parts.append(("ground_truth", way.true, "#8899a6ff"))
-    for name, trajectory, rgba in parts:
-        strip = rr.LineStrips3D([trajectory.positions], colors=[_rgba(rgba)], radii=rr.Radius.ui_points(1.5))
+    for name, trajectory, text in parts:
+        strip = rr.LineStrips3D([trajectory.positions], colors=[rgba(text)], radii=rr.Radius.ui_points(1.5))
         stream.log(f"{entity}/{name}", strip, static=True)
 
 
-def _rgba(text: str) -> list[int]:
+def rgba(text: str) -> list[int]:
+    """A color as four numbers.
+
+    Args:
+        text: "#" and eight hexadecimal digits.
+    """
     return [int(text[i : i + 2], 16) for i in (1, 3, 5, 7)]
 
 
@@ -110,14 +123,19 @@ def _log_map(stream: rr.RecordingStream, entity: str, robot: RobotRun, max_gauss
     fused = robot.fused_map
     chosen = thinned(fused.gaussians, max_gaussians)
     shown = fused.gaussians.select(chosen)
-    stream.log(f"{entity}/fused", _splats(shown, shown.colors), static=True)
+    stream.log(f"{entity}/fused", splats(shown, shown.colors), static=True)
     if fused.information is not None:
         colors, _, _ = sigma_colors(position_sigma_m(fused.information.geometry))
-        stream.log(f"{entity}/uncertainty", _splats(shown, colors[chosen]), static=True)
+        stream.log(f"{entity}/uncertainty", splats(shown, colors[chosen]), static=True)
 
 
-def _splats(gaussians: Gaussians, colors: NDArray[np.float32]) -> Any:
-    """Gaussians as Rerun draws them: linear scales, xyzw quaternions, RGBA with the peak opacity."""
+def splats(gaussians: Gaussians, colors: NDArray[np.float32]) -> Any:
+    """Gaussians as Rerun draws them: linear scales, xyzw quaternions, RGBA with the peak opacity.
+
+    Args:
+        gaussians: in the frame of their entity.
+        colors: float32 [n, 3], 0..1.
+    """
     import rerun as rr
 
     opacity = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
@@ -145,7 +163,7 @@ def _log_keyframes(
             resolution=[log.camera.width, log.camera.height],
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=0.25,
-            color=_rgba(color_of(index) + "ff"),
+            color=rgba(color_of(index) + "ff"),
         )
         stream.log(entity, pinhole, static=True)
         for keyframe in robot.keyframes:
@@ -198,7 +216,7 @@ def _log_network(stream: rr.RecordingStream, session: Session) -> None:
     names = list(session.run.robots)
     stream.log(
         "network",
-        rr.GraphNodes(names, labels=names, colors=[_rgba(color_of(i) + "ff") for i in range(len(names))]),
+        rr.GraphNodes(names, labels=names, colors=[rgba(color_of(i) + "ff") for i in range(len(names))]),
         rr.GraphEdges([(link.sender, link.receiver) for link in session.links], graph_type="directed"),
         static=True,
     )

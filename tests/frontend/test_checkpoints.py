@@ -47,7 +47,7 @@ class Runs:
         """The digest of its log; None if it was killed after so many steps."""
         begin = len(self.steps)
 
-        def report(part: str, done: int, total: int) -> None:
+        def report(part: str, done: int, total: int, shown: object) -> None:
             assert 0 <= done <= total
             if len(self.steps) - begin == most:
                 raise KilledError
@@ -78,7 +78,7 @@ def undisturbed(log: Path, config: FrontendConfig, folder: Path) -> tuple[str, i
     """Digest and number of steps."""
     steps: list[str] = []
     out = folder / "undisturbed.mcap"
-    report = Checkpoints(report=lambda part, done, total: steps.append(part))
+    report = Checkpoints(report=lambda part, done, total, shown: steps.append(part))
     run_frontend(log, out, config, checkpoints=report)
     return content_digest(out), len(steps)
 

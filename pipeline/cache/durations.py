@@ -1,0 +1,133 @@
+"""Time that the stages of a run take, before they start, and while they are at work.
+
+Seconds of a core of 2.6 GHz, fitted to the parts of whole runs (docs/reference/checks.md). What a machine is slower by,
+and what a recording is harder by, shows while the run goes on, or in the results of earlier ones (`checks.measured`).
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Mapping, Sequence
+
+from duagc.pipeline.config.mapping import MappingConfig
+
+Size = Mapping[str, int]
+"""`frames`, `pixels` of an image and `keyframes` of a robot; `moved`: 1 if depth is of other times than color."""
+TRACKING_S, POSES_S, MODEL_S = (0.007, 0.020), (0.006, 0.020), (0.001, 0.055)
+"""Of a frame: in any case, and for every million pixels."""
+MOVED_S = 0.35
+"""Of moving the depth of a frame, for every million pixels; a frame is read three times."""
+MAPPING_S = (0.002, 0.135)
+"""The same of a step of mapping, of which every keyframe takes some."""
+FINAL_S = (0.002, 0.160)
+"""The same of a step of the final optimization."""
+START_S = 2.0
+"""Of a process."""
+INFORMATION_S = 0.020
+"""Of a frame, for every million pixels."""
+FUSION_S = (6.0, 60.0)
+"""Of a robot that has peers: in any case, and for every million pixels of an image."""
+EVALUATION_S = 0.35
+"""Of a frame, for every million pixels."""
+EXCHANGE_S = 4.0
+"""Of a pair of robots, and of the team."""
+READERS_S = 6.0
+"""Report and view."""
+SHARED_CORE = 1.6
+"""By how much slower two processes are that share a core."""
+
+
+def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
+    """Time of the parts of a front end.
+
+    Args:
+        size: of the robot's log.
+        mapping: how long its map is optimized.
+    """
+    megapixels, frames, keyframes = size["pixels"] * 1e-6, size["frames"], size["keyframes"]
+
+    def of(cost: tuple[float, float]) -> float:
+        return cost[0] + cost[1] * megapixels
+
+    moved = MOVED_S * megapixels * frames if size.get("moved") else 0.0
+    views = keyframes + min(mapping.support_views, max(frames - keyframes, 0))
+    steps = max(mapping.final_iterations * keyframes, mapping.final_iterations_view * views)
+    return {
+        "tracking": START_S + of(TRACKING_S) * frames + (of(TRACKING_S) * frames + moved if moved else 0.0),
+        "poses": of(POSES_S) * frames + moved,
+        "mapping": of(MAPPING_S) * mapping.iterations * keyframes,
+        "final": of(FINAL_S) * min(steps, mapping.final_iterations_max),
+        "model": of(MODEL_S) * frames + moved,
+    }
+
+
+def front_end_s(size: Size, mapping: MappingConfig | None = None) -> float:
+    """Time of the front end of a robot.
+
+    Args:
+        size: of its log.
+        mapping: how long its map is optimized; None: as it is by default.
+    """
+    return sum(front_end_parts(size, mapping or MappingConfig()).values())
+
+
+def information_s(size: Size) -> float:
+    """Time of the Fisher information of a robot.
+
+    Args:
+        size: of its log.
+    """
+    return INFORMATION_S * size["pixels"] * 1e-6 * size["frames"]
+
+
+def fusion_s(size: Size) -> float:
+    """Time of the fusion of a robot that has peers.
+
+    Args:
+        size: of its log.
+    """
+    return FUSION_S[0] + FUSION_S[1] * size["pixels"] * 1e-6
+
+
+def evaluation_s(size: Size) -> float:
+    """Time of the evaluation of a robot.
+
+    Args:
+        size: of its log.
+    """
+    return EVALUATION_S * size["pixels"] * 1e-6 * size["frames"]
+
+
+def exchange_s(robots: int) -> float:
+    """Time of the exchange of a team.
+
+    Args:
+        robots: how many.
+    """
+    return EXCHANGE_S * (1 + robots * (robots - 1) / 2) if robots > 1 else 0.0
+
+
+def side_by_side_s(begun: Iterable[float], waiting: Sequence[float], workers: int) -> float:
+    """Time until all of some tasks are done.
+
+    Args:
+        begun: what is left of those that are at work.
+        waiting: of those that begin in this order, as soon as a worker has none.
+        workers: how many there are.
+    """
+    ends = sorted(begun)
+    ends += [0.0] * (workers - len(ends))
+    heapq.heapify(ends)
+    for seconds in waiting:
+        heapq.heapreplace(ends, ends[0] + seconds)
+    return max(ends, default=0.0)
+
+
+def slowdown(workers: int, cores: int) -> float:
+    """By how much slower each of some processes is than one alone.
+
+    Args:
+        workers: processes at work.
+        cores: of the machine, not counting the threads of a core.
+    """
+    return 1.0 if workers <= cores else SHARED_CORE * max(1.0, workers / (2 * cores))

@@ -1,0 +1,171 @@
+"""The robots of a run that have no results yet: prepared in processes of their own, as many as fit into memory."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from duagc.pipeline import steps, watch
+from duagc.pipeline.base.machine import memory_bytes
+from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.cache.carrier import Carrier
+from duagc.pipeline.cache.file_digests import FileDigests
+from duagc.pipeline.cache.footprint import fitting, robot_bytes
+from duagc.pipeline.cache.stage_key import StageKey
+from duagc.pipeline.cache.store import Store
+from duagc.pipeline.chain import Chain, Prepared
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.recording import Recording
+from duagc.pipeline.run_plan import RunPlan
+from duagc.pipeline.runs import stages
+
+MEASURED = 20  # results of front ends that memory is estimated from
+Say = Callable[[str], None]
+
+
+def say(line: str) -> None:
+    """Say something on standard error."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def stages_of(run: Path) -> dict[str, Any]:
+    """What the manifest of a run says of its stages; empty if there is none, or none that says it.
+
+    Args:
+        run: folder of the run.
+    """
+    try:
+        content = json.loads((run / "manifest.json").read_bytes())
+        rows = content["stages"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    return rows if isinstance(rows, dict) else {}
+
+
+def carrier_of(
+    folder: Path,
+    config: RunConfig,
+    plan: RunPlan,
+    *,
+    log: Say,
+    place: Path,
+    looking: bool = False,
+    begun: Callable[[StageKey, bool], None] = lambda key, stored: None,
+) -> Carrier:
+    """What carries out the stages of a run.
+
+    Args:
+        folder: of the run.
+        config: settings of all stages.
+        plan: how it is done.
+        log: gets a line when something is unusual.
+        place: where an earlier run may be.
+        looking: only look what is there: nothing is computed or written.
+        begun: called before a stage is computed, or, with True, when it was taken from the store.
+    """
+    store = None if plan.store is None else Store(plan.store)
+    earlier = {} if store is None else stages_of(place)
+    return Carrier(
+        folder,
+        config,
+        store,
+        log,
+        again=plan.again,
+        looking=looking,
+        earlier=earlier,
+        place=place,
+        begun=begun,
+    )
+
+
+def workers_that_fit(
+    sizes: Sequence[dict[str, int]], carrier: Carrier, asked: int, *, share: float = 1.0
+) -> int:
+    """How many of some robots are looked at at the same time, so that they fit into memory.
+
+    Args:
+        sizes: `frames` and `pixels` of an image of every robot.
+        carrier: of the run, that says so if they are fewer.
+        asked: how many the user wants.
+        share: of memory, relative to the preparation of a robot.
+    """
+    asked = min(asked, len(sizes))
+    if asked <= 1:
+        return 1
+    measured = [] if carrier.store is None else carrier.store.recent(stages.FRONTEND.name, MEASURED)
+    needed = [share * robot_bytes(size, measured) for size in sizes]
+    _, free = memory_bytes()
+    workers = fitting(asked, needed, free)
+    if workers < asked and free is not None:
+        carrier.say(
+            f"{workers} at a time instead of {asked}: a robot may take {max(needed) / 1e9:.1f} GB of memory, "
+            f"found {free / 1e9:.1f} GB free"
+        )
+    return workers
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Front end and information of robots, each by one of some processes.
+
+    Attributes:
+        recording: that the run is of.
+        folder: of the run.
+        config: settings of all stages.
+        plan: how it is done.
+        place: where an earlier run may be.
+        where: of the server that shows the run; None: nobody follows.
+    """
+
+    recording: Path
+    folder: Path
+    config: RunConfig
+    plan: RunPlan
+    place: Path
+    where: Any = None
+
+    def run(
+        self, robots: Sequence[str], workers: int, *, alone: bool, hear: Callable[[watch.Step], None]
+    ) -> dict[str, Prepared]:
+        """Prepare robots; by name of the component.
+
+        Args:
+            robots: their names.
+            workers: how many at the same time.
+            alone: leave the information out.
+            hear: gets steps of front ends, in another thread.
+        """
+        threads = steps.threads_per_worker(workers)
+        found: dict[str, Prepared] = {}
+        with watch.listening(hear) as queue, worker_pool(workers, watch.keep_queue, (queue,)) as pool:
+            tasks = [pool.submit(self.prepare, robot, threads=threads, alone=alone) for robot in robots]
+            for task in tasks:
+                found |= task.result()
+        return found
+
+    def prepare(self, robot: str, *, threads: int, alone: bool) -> dict[str, Prepared]:
+        """One robot, in a process of its own.
+
+        Args:
+            robot: its name.
+            threads: of the kernels; changes no bit.
+            alone: leave the information out.
+        """
+
+        def log(line: str) -> None:
+            say(f"duagc: {line}")
+
+        heard = watch.in_worker(self.where)
+        carrier = carrier_of(self.folder, self.config, self.plan, log=log, place=self.place)
+        digests = FileDigests(None) if carrier.store is None else carrier.store.files
+        try:
+            chain = Chain(Recording(self.recording), carrier, digests, heard)
+            return chain.robot(robot, threads=threads, alone=alone)
+        finally:
+            heard.tell((robot, "", 0, 0))
+            if heard.follower is not None:
+                heard.follower.close()

@@ -1,0 +1,110 @@
+"""The time that a run still takes is known after a tenth of it."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from duagc.pipeline.base import machine
+from duagc.pipeline.cache import durations
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.runs import stages
+from duagc.pipeline.time_left import TimeLeft, in_words
+
+MAPPING = MappingConfig()
+STEPS = {"tracking": 50, "mapping": 12, "final": 200, "model": 50}
+LATER = (stages.EXCHANGE, stages.FUSION, stages.EVALUATION, stages.REPORT, stages.VIEW)
+
+
+class Simulated:
+    """A run whose stages take what is predicted, times a factor for the machine, and one for each part."""
+
+    def __init__(self, robots: int, workers: int, slower: float, uneven: float) -> None:
+        self.now = 0.0
+        self.slower, self.uneven = slower, itertools.cycle((uneven, 1 / uneven, 1.0))
+        names = [f"robot{k}" for k in range(robots)]
+        self.sizes = {name: {"frames": 300 + 40 * k, "pixels": 640 * 480} for k, name in enumerate(names)}
+        self.times = TimeLeft(
+            self.sizes, MAPPING, found={}, workers=workers, wanted=LATER, clock=lambda: self.now
+        )
+        self.workers = min(workers, robots)
+        self.said: list[tuple[float, float]] = []  # time, and time left
+
+    def front_end(self, robot: str, begin: float) -> list[tuple[float, tuple[str, str, int, int]]]:
+        """Steps with their times."""
+        keyframes, steps = self.sizes[robot]["frames"] // 20, []
+        size = {**self.sizes[robot], "keyframes": keyframes}
+        at = begin
+        inflation = self.slower * durations.slowdown(self.workers, machine.cores())
+        for part, seconds in durations.front_end_parts(size, MAPPING).items():
+            took = seconds * inflation * next(self.uneven)
+            if part == "poses":
+                steps.append((at, (robot, "keyframes", keyframes, keyframes)))
+            name = part if part == "tracking" else f"{robot}.{part}"
+            count = STEPS.get(part, 3)
+            steps += [(at + took * (k + 1) / count, (robot, name, k + 1, count)) for k in range(count)]
+            at += took
+        at += inflation * durations.information_s(size)
+        return [*steps, (at, (robot, "", 0, 0))]
+
+    def run(self) -> float:
+        """The time that it takes."""
+        free, steps = [0.0] * self.workers, []
+        for robot in self.sizes:
+            begin = min(free)
+            made = self.front_end(robot, begin)
+            free[free.index(begin)] = made[-1][0]
+            steps += made
+        for self.now, step in sorted(steps):
+            self.times.step(*step)
+            self.said.append((self.now, self.times.left_s()))
+        for stage, seconds in dict(self.times._later).items():
+            self.times.begin(stage)
+            for _ in range(10):
+                self.said.append((self.now, self.times.left_s()))
+                self.now += self.slower * seconds / 10
+        return self.now
+
+
+@pytest.mark.parametrize("robots", [1, 2, 5])
+@pytest.mark.parametrize("slower", [0.4, 1.0, 3.0])
+def test_it_is_right_within_a_third_after_a_tenth(robots: int, slower: float) -> None:
+    simulated = Simulated(robots, 2, slower, uneven=1.15)
+    whole = simulated.run()
+    heard = [(now, left) for now, left in simulated.said if 0.1 * whole <= now <= 0.95 * whole]
+    assert len(heard) > 50
+    # at the very end, when seconds are left, a twentieth of the whole is allowed
+    wrong = [
+        (now, left, whole - now)
+        for now, left in heard
+        if abs(left - (whole - now)) > max((whole - now) / 3, whole / 20)
+    ]
+    assert not wrong, wrong[:5]
+
+
+def test_before_the_first_step_it_is_what_is_predicted() -> None:
+    simulated = Simulated(2, 2, 1.0, uneven=1.0)
+    predicted = simulated.times.left_s()
+    assert predicted == pytest.approx(simulated.run(), rel=0.2)
+
+
+def test_a_front_end_that_goes_on_is_not_taken_for_a_fast_one() -> None:
+    fresh, resumed = Simulated(1, 1, 1.0, 1.0), Simulated(1, 1, 1.0, 1.0)
+    steps = fresh.front_end("robot0", 0.0)
+    for fresh.now, step in steps[:200]:
+        fresh.times.step(*step)
+    for now, step in steps[190:200]:
+        resumed.now = now - steps[190][0]
+        resumed.times.step(*step)
+    assert resumed.times.left_s() == pytest.approx(fresh.times.left_s(), rel=0.05)
+
+
+def test_a_line_says_where_the_robots_are() -> None:
+    simulated = Simulated(2, 2, 1.0, 1.0)
+    simulated.times.step("robot0", "tracking", 30, 300)
+    simulated.times.step("robot1", "robot1.final", 100, 1000)
+    line = simulated.times.line()
+    assert line.startswith("robot0: tracking 30/300, robot1: final 100/1000; ")
+    assert line.endswith(" left of the run")
+    assert [in_words(s) for s in (7.4, 150.0, 8000.0)] == ["7 s", "2 min", "2.2 h"]
