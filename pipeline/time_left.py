@@ -80,26 +80,31 @@ class TimeLeft:
             name: RobotWork({"keyframes": self._guess(size), **size}, "keyframes" in size)
             for name, size in robots.items()
         }
-        self._later = self._stages([*(work.size for work in self.robots.values()), *found.values()], wanted)
-        self._now: tuple[str, float] | None = None  # stage that this process does, and since when
-        self._rates: tuple[float, float] = (0.0, 0.0)  # measured and predicted seconds of stages of the team
+        self._later = self._units([*(work.size for work in self.robots.values()), *found.values()], wanted)
+        self._now: tuple[str, float, float] | None = (
+            None  # stage that this process does, predicted, since when
+        )
+        self._taken: dict[
+            str, tuple[float, float]
+        ] = {}  # measured and predicted seconds of stages that are done
 
     @staticmethod
     def _guess(size: Size) -> int:
         return max(1, round(KEYFRAMES_OF_FRAMES * size["frames"]))
 
-    def _stages(self, sizes: Sequence[Size], wanted: Sequence[stages.Stage]) -> dict[str, float]:
-        """Predicted seconds of what follows the front ends, in order."""
+    def _units(self, sizes: Sequence[Size], wanted: Sequence[stages.Stage]) -> list[tuple[str, float]]:
+        """What follows the front ends, in order: stages, and predicted seconds; fusion robot by robot."""
         slower = durations.slowdown(self._workers, cores())
         evaluated = durations.side_by_side_s((), [durations.evaluation_s(s) for s in sizes], self._workers)
-        expected = {
-            stages.EXCHANGE: durations.exchange_s(len(sizes)),
-            stages.FUSION: sum(map(durations.fusion_s, sizes)) if len(sizes) > 1 else 0.0,
-            stages.EVALUATION: slower * evaluated,
-            stages.REPORT: durations.READERS_S / 2,
-            stages.VIEW: durations.READERS_S / 2,
-        }
-        return {stage.name: seconds for stage, seconds in expected.items() if stage in wanted}
+        fused = [(stages.FUSION, durations.fusion_s(size)) for size in sizes] if len(sizes) > 1 else []
+        expected = [
+            (stages.EXCHANGE, durations.exchange_s(len(sizes))),
+            *fused,
+            (stages.EVALUATION, slower * evaluated),
+            (stages.REPORT, durations.READERS_S / 2),
+            (stages.VIEW, durations.READERS_S / 2),
+        ]
+        return [(stage.name, seconds) for stage, seconds in expected if stage in wanted]
 
     def step(self, robot: str, part: str, done: int, total: int) -> None:
         """A step of a front end.
@@ -139,17 +144,17 @@ class TimeLeft:
         """
         with self._lock:
             now = self._clock()
-            names = list(self._later)
             for work in self.robots.values():
                 work.took_s = now - (work.began_s or now) if work.took_s is None else work.took_s
-            if stage not in names or (self._now is not None and self._now[0] == stage):
-                return
             if self._now is not None:
-                name, since = self._now
-                self._rates = (self._rates[0] + now - since, self._rates[1] + self._later[name])
-            for before in names[: names.index(stage)]:
-                self._later[before] = 0.0
-            self._now = stage, now
+                before, predicted, since = self._now
+                taken = self._taken.get(before, (0.0, 0.0))
+                self._taken[before] = taken[0] + now - since, taken[1] + predicted
+            self._now = None
+            if stage in (name for name, _ in self._later):
+                while self._later[0][0] != stage:
+                    self._later.pop(0)
+                self._now = *self._later.pop(0), now
 
     def left_s(self) -> float:
         """Seconds until the run is done."""
@@ -163,10 +168,11 @@ class TimeLeft:
                 left = slower * rate * (self._whole(work) - self._done(work))
                 (waiting if work.began_s is None else begun).append(left)
             seconds = durations.side_by_side_s(begun, waiting, self._workers)
-            for name, predicted in self._later.items():
-                whole = rate * predicted
-                spent = now - self._now[1] if self._now is not None and self._now[0] == name else 0.0
-                seconds += max(whole - spent, LEAST_LEFT * whole)
+            if self._now is not None:
+                name, predicted, since = self._now
+                whole = self._rate_of(name, rate) * predicted
+                seconds += max(whole - (now - since), LEAST_LEFT * whole)
+            seconds += sum(self._rate_of(name, rate) * predicted for name, predicted in self._later)
             return seconds
 
     def line(self) -> str:
@@ -176,7 +182,8 @@ class TimeLeft:
             at_work = [f"{name}: {work.part}" for name, work in self.robots.items() if work.part]
             if self._now is not None:
                 at_work = [self._now[0]]
-        return f"{', '.join(at_work)}; {in_words(left)} left of the run"
+        where = f"{', '.join(at_work)}; " if at_work else ""
+        return f"{where}{in_words(left)} left of the run"
 
     def _whole(self, work: RobotWork) -> float:
         return durations.front_end_s(work.size, self._mapping) + durations.information_s(work.size)
@@ -188,13 +195,18 @@ class TimeLeft:
     def _rate(self) -> float:
         """Measured seconds for every predicted one."""
         now = self._clock()
-        measured, predicted = self._rates
+        measured, predicted = (sum(values) for values in zip((0.0, 0.0), *self._taken.values(), strict=True))
         for work in self.robots.values():
             if work.began_s is not None:
                 measured += work.took_s if work.took_s is not None else now - work.began_s
                 done = self._done(work) if work.took_s is None else self._whole(work)
                 predicted += durations.slowdown(self._workers, cores()) * (done - work.earlier_s)
         return (TRUSTED_S + measured) / (TRUSTED_S + predicted)
+
+    def _rate_of(self, stage: str, rate: float) -> float:
+        """The same of a stage: its own once something of it is done."""
+        measured, predicted = self._taken.get(stage, (0.0, 0.0))
+        return (TRUSTED_S * rate + measured) / (TRUSTED_S + predicted)
 
 
 def _part_of(part: str) -> str:

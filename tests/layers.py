@@ -166,14 +166,14 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
     (
         _part("doctor", "what a machine has", "base kernels"),
         _part("run_plan", "how a run is carried out", "base runs"),
-        _part("watch", "hears of a run at work", "base viewing"),
-        _part("time_left", "how long a run still takes", "base config runs cache"),
+        _part("watch", "observers", "base viewing"),
+        _part("time_left", "time left", "base config runs cache"),
     ),
     (_part("chain", "the stages in their order", "base schemas recording runs cache steps watch"),),
     (
         _part(
             "preparation",
-            "robots in processes of their own",
+            "robots in processes",
             "base config runs recording cache steps watch chain run_plan",
         ),
     ),

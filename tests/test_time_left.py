@@ -59,7 +59,7 @@ class Simulated:
         for self.now, step in sorted(steps):
             self.times.step(*step)
             self.said.append((self.now, self.times.left_s()))
-        for stage, seconds in dict(self.times._later).items():
+        for stage, seconds in list(self.times._later):
             self.times.begin(stage)
             for _ in range(10):
                 self.said.append((self.now, self.times.left_s()))
