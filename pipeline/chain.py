@@ -136,13 +136,17 @@ class Chain:
         log, carrier = self._recording.log(name), self._carrier
         folder = carrier.folder / "robots" / name
 
+        inputs = _own(name, robot) | {"session": exchange.content(f"robots/{name}/{SESSION}")}
+
         def fuse(timing: Timing) -> dict[str, Any]:
             settings = carrier.settings_of(stages.FUSION)
+            checkpoints = carrier.checkpoints(carrier.key(stages.FUSION, name, inputs))
             with timing.stage(stages.FUSION, folder, name):
-                return steps.fusion(name, log, folder, settings)
+                result = steps.fusion(name, log, folder, settings, checkpoints=checkpoints)
+            timing.went_on(label("fusion", name), *checkpoints.before_s)
+            return result
 
-        session = exchange.content(f"robots/{name}/{SESSION}")
-        return carrier.carry(stages.FUSION, name, _own(name, robot) | {"session": session}, fuse)
+        return carrier.carry(stages.FUSION, name, inputs, fuse)
 
     def reader(
         self,

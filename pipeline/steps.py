@@ -183,7 +183,9 @@ def exchange(
         write_session_result(folder / "robots" / robot / NAME, result)
 
 
-def fusion(robot: str, log: Path, folder: Path, config: RunConfig) -> dict[str, Any]:
+def fusion(
+    robot: str, log: Path, folder: Path, config: RunConfig, *, checkpoints: Checkpoints
+) -> dict[str, Any]:
     """Fused map and corrected trajectory of one robot, from what it took home.
 
     Args:
@@ -191,6 +193,7 @@ def fusion(robot: str, log: Path, folder: Path, config: RunConfig) -> dict[str, 
         log: of its sensors.
         folder: of its own results.
         config: of the run.
+        checkpoints: from which it goes on, and to which it saves; they change no bit of the result.
 
     Returns:
         `left_out`: neighbors of whose maps nothing is used, and why; `robots`: in its component.
@@ -198,12 +201,18 @@ def fusion(robot: str, log: Path, folder: Path, config: RunConfig) -> dict[str, 
     from duagc.pipeline.runs.session_file import NAME, read_session_result
 
     result = read_session_result(folder / NAME)
-    left_out = fuse_robot(robot, log, folder, result, config=config)
+    left_out = fuse_robot(robot, log, folder, result, config=config, checkpoints=checkpoints)
     return {"left_out": left_out, "robots": len(result.component)}
 
 
 def fuse_robot(
-    robot: str, log: Path, folder: Path, result: SessionResult, *, config: RunConfig
+    robot: str,
+    log: Path,
+    folder: Path,
+    result: SessionResult,
+    *,
+    config: RunConfig,
+    checkpoints: Checkpoints | None = None,
 ) -> dict[str, str]:
     """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time.
 
@@ -223,6 +232,7 @@ def fuse_robot(
         weights=config.exchange.weights,
         seed=config.seed,
         threads=threads_per_worker(1),
+        checkpoints=checkpoints,
     )
     return {check.peer: check.reason for check in checks if not check.trusted}
 

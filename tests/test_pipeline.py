@@ -1,12 +1,14 @@
 """The whole job on a tiny team: determinism, firewall, replay, and the effect of what crosses the network."""
 
 import json
+import math
 import os
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -14,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from duagc.converters.simulate.team import simulate
+from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.base import dump_config, load_config
 from duagc.pipeline.config.run import RunConfig
@@ -30,6 +33,7 @@ from duagc.pipeline.report import write_report
 from duagc.pipeline.runner import run
 from duagc.pipeline.runs.digest import digest, digest_file, result_files
 from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.runs.session_file import read_session_result
 from duagc.pipeline.steps import agent_input, fuse_robot
 from duagc.pipeline.viewing.inspection import Inspector, format_facts, format_loop_closures
 from tests.fixtures.commands import assert_one_line, duagc_here
@@ -506,6 +510,32 @@ def test_a_run_of_three_robots_is_the_same_with_one_two_and_four_workers(tmp_pat
         assert digest(made) == digest(runs[0])
         for name in ("metrics.json", "metrics.parquet"):
             assert (made / name).read_bytes() == (runs[0] / name).read_bytes()
+
+
+def test_a_fusion_that_is_killed_goes_on_with_the_same_bits(
+    folder: Path, recording: Path, finished: Path
+) -> None:
+    class KilledError(Exception):
+        """In place of a signal."""
+
+    def kill(part: str, done: int, total: int, shown: object) -> None:
+        if (part, done) == ("training", total // 2):
+            raise KilledError
+
+    robot = folder / "killed_fusion" / "alpha"
+    shutil.copytree(finished / "robots" / "alpha", robot)
+    log, result = Recording(recording).log("alpha"), read_session_result(robot / "session.npz")
+    config, said = load_config(RunConfig, overrides=list(SMALL)), list[str]()
+    for report in (kill, None):
+        place = folder / "killed_fusion" / "checkpoints"
+        save = Checkpoints(place, every_s=0.0, largest_share=math.inf, say=said.append, report=report)
+        with suppress(KilledError):
+            fuse_robot("alpha", log, robot, result, config=config, checkpoints=save)
+            assert report is None
+    assert len(said) == 1
+    assert said[0].startswith("training: goes on at ")
+    for name in ("fused.mcap", "fused.ply", "refined.ply"):
+        assert digest_file(robot / name) == digest_file(finished / "robots" / "alpha" / name)
 
 
 def test_stages_have_names(recording: Path, folder: Path) -> None:

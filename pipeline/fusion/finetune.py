@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.fusion import FinetuneConfig
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
@@ -29,6 +32,7 @@ from duagc.pipeline.splat.optimizer import smoothstep_decay
 
 PEERS_UNTIL = 0.6
 """Share of the steps after which only own images are used."""
+PART = "training"
 _TRAINED = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
 
@@ -51,6 +55,7 @@ def finetune_map(
     *,
     trained: NDArray[np.bool_] | None = None,
     peer_views: Sequence[PosedRgbd] = (),
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> Gaussians:
     """The map after some training steps, each on one view.
 
@@ -63,6 +68,7 @@ def finetune_map(
         context: camera and settings; `config.finetune` is the schedule.
         trained: bool [n], which of the Gaussians may change; None: all.
         peer_views: as peers' maps show them.
+        checkpoints: of the stage.
     Returns:
         As many Gaussians, in the same order, with the same ids and anchors.
     """
@@ -80,19 +86,32 @@ def finetune_map(
     # the streams keep the names that they had: under other names they would draw other views
     own = _in_turn(views, context.seed, "fusion.refine")
     peer = _in_turn(peer_views, context.seed, "fusion.refine.peers")
+    first = 0
+    if (saved := checkpoints.resume(PART)) is not None:
+        first, (gaussians, state) = saved
+        adam.go_on(state)
     for step in range(total):
         of_peer = step < head and (step + 1) * peer_steps // head > step * peer_steps // head
+        view = next(peer if of_peer else own)
+        if step < first:
+            continue  # its view was taken by the process before
         share = config.rate * smoothstep_decay(step, total, config.rate_decay)
         stepped, _ = take_step(
             gaussians,
             context.camera,
-            _training_view(next(peer if of_peer else own), weights.depth_huber_m),
+            _training_view(view, weights.depth_huber_m),
             adam=adam,
             rates=config.rates.times(share),
             least_log_scales=floor,
         )
         gaussians = stepped if trained is None else _where(trained, stepped, gaussians)
+        checkpoints.at(PART, step + 1, total, partial(_state, gaussians, adam))
     return gaussians
+
+
+def _state(gaussians: Gaussians, adam: CompiledAdam) -> tuple[Any, ...]:
+    """From which the training can go on."""
+    return gaussians, adam.state()
 
 
 def _training_view(view: PosedRgbd, huber_m: float) -> TrainingView:

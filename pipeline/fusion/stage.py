@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
@@ -75,6 +76,7 @@ def run_fusion(
     weights: WeightKind = "block",
     seed: int = 0,
     threads: int = 1,
+    checkpoints: Checkpoints | None = None,
 ) -> tuple[PeerCheck, ...]:
     """Write fused.mcap, fused.ply, refined.ply, trajectory.tum and odometry.tum of one robot.
 
@@ -88,6 +90,7 @@ def run_fusion(
         weights: kind of the session.
         seed: of the run.
         threads: of the rasterizer; changes no bit.
+        checkpoints: of this stage and robot, from which it goes on, and to which it saves; they change no bit.
     Returns:
         The check of every peer's map against own images.
     Raises:
@@ -103,7 +106,7 @@ def run_fusion(
     if len(result.component) > 1:
         num_support = config.finetune.support_views
         views = training_views(source, frames, T_world_camera, num_support=num_support, moving=moving)
-    fusion = _fuse(own, result, views, context)
+    fusion = _fuse(own, result, views, context, checkpoints or Checkpoints())
     refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
     write_ply(folder / "fused.ply", fusion.fused.gaussians)
     write_ply(folder / "refined.ply", refined)
@@ -115,7 +118,13 @@ def run_fusion(
     return fusion.valid.checks
 
 
-def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], context: MapContext) -> _Fusion:
+def _fuse(
+    own: RobotData,
+    result: SessionResult,
+    views: Sequence[PosedRgbd],
+    context: MapContext,
+    save: Checkpoints,
+) -> _Fusion:
     """Validate the peers' maps, fuse, update opacities, finetune.
 
     Args:
@@ -123,7 +132,19 @@ def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], con
         result: of the session.
         views: own images, keyframes first; none for a robot that met no other.
         context: camera and settings.
+        save: checkpoints of the stage.
     """
+    valid, fused = save.done("fused", lambda: _untrained(own, result, views, context))
+    if len(result.component) < 2:
+        return _Fusion(fused, None, valid)
+    trained = _finetuned(own, result, fused, valid, views=views, context=context, save=save)
+    return _Fusion(fused, trained, valid)
+
+
+def _untrained(
+    own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], context: MapContext
+) -> tuple[ValidatedPeers, FusedMap]:
+    """Validate the peers' maps, fuse, update opacities."""
     poses, keyframe_views = result.T_world_keyframe_of, views[: own.keyframes]
     mine = in_world(result.own_evidence, poses[own.robot], context.weights)
     valid = validate_peer_maps(
@@ -147,7 +168,7 @@ def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], con
         contradicted=valid.contradicted,
     )
     if len(result.component) < 2:
-        return _Fusion(fused, None, valid)
+        return valid, fused
     fused = update_opacities(
         fused,
         keyframe_views,
@@ -156,7 +177,7 @@ def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], con
         color_sigma=own.information.color_sigma,
         pixels_per_sample=own.information.color_pixels_per_sample,
     )
-    return _Fusion(fused, _finetuned(own, result, fused, valid, views=views, context=context), valid)
+    return valid, fused
 
 
 def _finetuned(
@@ -167,6 +188,7 @@ def _finetuned(
     *,
     views: Sequence[PosedRgbd],
     context: MapContext,
+    save: Checkpoints,
 ) -> Gaussians | None:
     """The fused map trained on own images and on renders of peers' maps; None if the settings have no steps."""
     config = context.config.finetune
@@ -182,7 +204,7 @@ def _finetuned(
             colors=fused.colors,
         )
     trained = None if shown else fused.source == fused.robots.index(own.robot)
-    return finetune_map(fused.gaussians, views, context, trained=trained, peer_views=shown)
+    return finetune_map(fused.gaussians, views, context, trained=trained, peer_views=shown, checkpoints=save)
 
 
 def training_views(
