@@ -95,7 +95,9 @@ class TimeLeft:
     def _units(self, sizes: Sequence[Size], wanted: Sequence[stages.Stage]) -> list[tuple[str, float]]:
         """What follows the front ends, in order: stages, and predicted seconds; fusion robot by robot."""
         slower = durations.slowdown(self._workers, cores())
-        evaluated = durations.side_by_side_s((), [durations.evaluation_s(s) for s in sizes], self._workers)
+        evaluated = durations.side_by_side_s(
+            (), [durations.evaluation_s(s, len(sizes)) for s in sizes], self._workers
+        )
         fused = [(stages.FUSION, durations.fusion_s(size)) for size in sizes] if len(sizes) > 1 else []
         expected = [
             (stages.EXCHANGE, durations.exchange_s(len(sizes))),

@@ -25,11 +25,11 @@ START_S = 2.0
 """Of a process."""
 INFORMATION_S = 0.020
 """Of a frame, for every million pixels."""
-FUSION_S = (6.0, 60.0)
+FUSION_S = (6.0, 200.0)
 """Of a robot that has peers: in any case, and for every million pixels of an image."""
-EVALUATION_S = 0.35
-"""Of a frame, for every million pixels."""
-EXCHANGE_S = 4.0
+EVALUATION_S = 0.40
+"""Of a frame of a robot and each robot whose map is drawn there, for every million pixels."""
+EXCHANGE_S = 6.0
 """Of a pair of robots, and of the team."""
 READERS_S = 6.0
 """Report and view."""
@@ -89,13 +89,14 @@ def fusion_s(size: Size) -> float:
     return FUSION_S[0] + FUSION_S[1] * size["pixels"] * 1e-6
 
 
-def evaluation_s(size: Size) -> float:
+def evaluation_s(size: Size, robots: int) -> float:
     """Time of the evaluation of a robot.
 
     Args:
         size: of its log.
+        robots: of the team, with itself: their maps are drawn at its views.
     """
-    return EVALUATION_S * size["pixels"] * 1e-6 * size["frames"]
+    return EVALUATION_S * size["pixels"] * 1e-6 * size["frames"] * robots
 
 
 def exchange_s(robots: int) -> float:

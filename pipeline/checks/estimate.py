@@ -53,7 +53,7 @@ def estimate(
     seconds = durations.READERS_S
     prepared = (durations.front_end_s(row) + durations.information_s(row) for row in rows)
     seconds += side_by_side_s("frontend", prepared)
-    seconds += side_by_side_s("evaluation", map(durations.evaluation_s, rows))
+    seconds += side_by_side_s("evaluation", (durations.evaluation_s(row, len(rows)) for row in rows))
     if len(rows) > 1:
         seconds += durations.exchange_s(len(rows))
         seconds += ratios.get("fusion", 1.0) * sum(map(durations.fusion_s, rows))

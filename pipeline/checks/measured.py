@@ -66,7 +66,7 @@ def _evaluations(store: Store, sizes: Mapping[str, Mapping[str, Any]]) -> Iterat
     """Of recordings whose logs are known by their size."""
     for entry in store.recent(EVALUATION.name, LAST):
         logs = {digest for digest in entry.key.inputs.values() if digest in sizes}
-        predicted = sum(durations.evaluation_s(sizes[digest]) for digest in logs)
+        predicted = sum(durations.evaluation_s(sizes[digest], len(logs)) for digest in logs)
         robots = {name.split("/")[1] for name in entry.key.inputs if name.startswith("robots/")}
         if len(logs) == len(robots) and predicted and _is_default(entry, EVALUATION):
             yield entry.timing["cpu_s"] / predicted

@@ -106,7 +106,7 @@ def run_fusion(
     if len(result.component) > 1:
         num_support = config.finetune.support_views
         views = training_views(source, frames, T_world_camera, num_support=num_support, moving=moving)
-    fusion = _fuse(own, result, views, context, checkpoints or Checkpoints())
+    fusion = _fuse(own, result, views, context, save=checkpoints or Checkpoints())
     refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
     write_ply(folder / "fused.ply", fusion.fused.gaussians)
     write_ply(folder / "refined.ply", refined)
@@ -123,6 +123,7 @@ def _fuse(
     result: SessionResult,
     views: Sequence[PosedRgbd],
     context: MapContext,
+    *,
     save: Checkpoints,
 ) -> _Fusion:
     """Validate the peers' maps, fuse, update opacities, finetune.

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from duagc.pipeline.base.workers import peak_memory_bytes
 from duagc.pipeline.runs.stages import Stage
 
 
@@ -51,14 +52,14 @@ class Timing:
             name: of what is done.
             robot: for whom; None for the whole team.
         """
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall, cpu = time.perf_counter(), _processor_s()
         yield
         self.stages[label(name, robot)] = {
             "stage": name,
             "robot": robot,
             "wall_s": round(time.perf_counter() - wall, 3),
-            "cpu_s": round(time.process_time() - cpu, 3),
-            "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "cpu_s": round(_processor_s() - cpu, 3),
+            "peak_rss_mb": round(peak_memory_bytes() / 2**20, 1),
         }
 
     def went_on(self, name: str, wall_s: float, cpu_s: float) -> None:
@@ -72,3 +73,9 @@ class Timing:
         row = self.stages[name]
         row["wall_s"] = round(row["wall_s"] + wall_s, 3)
         row["cpu_s"] = round(row["cpu_s"] + cpu_s, 3)
+
+
+def _processor_s() -> float:
+    """Processor time of this process, and of those that it has started and waited for."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime

@@ -76,7 +76,7 @@ def test_a_machine_that_was_slow_is_predicted_to_be_slow(tmp_path: Path) -> None
     keep(store, FRONTEND, {"log": "c"}, 9.0 * front_end_s(SIZE), "frontend.mapping.iterations=99")
     keep(store, FUSION, {"log": "a"}, 99.0)  # alone: it says nothing of a robot that has peers
     team = {"log": "", "recording: alpha.mcap": "a", "robots/alpha/frontend.mcap": "x"}
-    keep(store, EVALUATION, team, 2.0 * evaluation_s(SIZE))
+    keep(store, EVALUATION, team, 2.0 * evaluation_s(SIZE, 1))
     keep(
         store, EVALUATION, team | {"robots/bravo/frontend.mcap": "y"}, 9.0
     )  # of a robot whose size is unknown
@@ -84,7 +84,7 @@ def test_a_machine_that_was_slow_is_predicted_to_be_slow(tmp_path: Path) -> None
     assert speed.ratios == pytest.approx({"frontend": 3.0, "evaluation": 2.0})
     assert speed.stages == 3
     slow, usual = (estimate({"alpha": SIZE}, ratios) for ratios in (speed.ratios, {}))
-    expected = 6.0 + 3.0 * front_end_s(SIZE) + 2.0 * evaluation_s(SIZE)
+    expected = 6.0 + 3.0 * front_end_s(SIZE) + 2.0 * evaluation_s(SIZE, 1)
     keep(store, FRONTEND, {"log": "dd"}, 3.0 * front_end_s(SIZE))
     keep(store, FUSION, {"log": "dd"}, 4.0 * fusion_s(SIZE))
     assert speed_of(store).ratios["fusion"] == pytest.approx(4.0)
