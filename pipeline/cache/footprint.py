@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping
 
 from duagc.pipeline.cache.store import StoredResults
 
-# Bytes of the process that prepares a robot, fitted to the peaks of whole runs (timing.json).
-PROCESS_BYTES = 125e6
-PIXEL_BYTES = (
-    2.0  # for every pixel of every frame: keyframes with their pyramids are about a share of the frames
-)
+# Bytes of the process that prepares robots one after the other, fitted to the peaks of whole runs (timing.json).
+PROCESS_BYTES = 135e6
+PYRAMID_BYTES = 400  # for every pixel of an image: pyramids that are kept between passes
+VIEW_BYTES = 14  # for every pixel of a view that the map is made of
+SUPPORT_VIEWS, KEYFRAMES_OF_FRAMES = 40, 0.06  # of these views
 MARGIN = 1.25
 SPARE = 0.1  # share of the free memory that is left alone
 
@@ -31,7 +31,8 @@ def robot_bytes(size: Mapping[str, int], measured: Iterable[StoredResults] = ())
 
 
 def _predicted(size: Mapping[str, int]) -> float:
-    return PROCESS_BYTES + PIXEL_BYTES * size["frames"] * size["pixels"]
+    views = min(size["frames"], SUPPORT_VIEWS) + KEYFRAMES_OF_FRAMES * size["frames"]
+    return PROCESS_BYTES + size["pixels"] * (PYRAMID_BYTES + VIEW_BYTES * views)
 
 
 def fitting(workers: int, needed_bytes: Iterable[float], free_bytes: int | None) -> int:
