@@ -488,17 +488,6 @@ def test_metrics_and_report_can_be_left_out_and_come_later(
         assert (out / name).read_bytes() == (finished / name).read_bytes()
 
 
-def test_metrics_do_not_depend_on_how_many_processes_make_them(
-    folder: Path, recording: Path, finished: Path
-) -> None:
-    """The run was evaluated by two."""
-    alone = folder / "evaluated_alone"
-    shutil.copytree(finished, alone)
-    evaluate(alone, recording, workers=1, threads=1, progress=False)
-    for name in ("metrics.json", "metrics.parquet"):
-        assert (alone / name).read_bytes() == (finished / name).read_bytes()
-
-
 @pytest.mark.slow
 def test_a_run_of_three_robots_is_the_same_with_one_two_and_four_workers(tmp_path: Path) -> None:
     recording = tmp_path / "recording"

@@ -68,7 +68,7 @@ class Simulated:
 
 
 @pytest.mark.parametrize("robots", [1, 2, 5])
-@pytest.mark.parametrize("slower", [0.4, 1.0, 3.0])
+@pytest.mark.parametrize("slower", [0.4, 3.0])
 def test_it_is_right_within_a_third_after_a_tenth(robots: int, slower: float) -> None:
     simulated = Simulated(robots, 2, slower, uneven=1.15)
     whole = simulated.run()
