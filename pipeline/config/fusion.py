@@ -86,6 +86,9 @@ class FusionConfig(Config):
     explained_opacity: float = Field(default=0.9, ge=0.0, le=1.0)
     """A keyframe explains only where the own map is at least this opaque; where depth is missing, the rendered one is
     used."""
+    finer: float | None = Field(default=1.3, ge=1.0)
+    """In the final map a peer's Gaussians replace own ones where the peer's keyframes saw the surface at so many times
+    the resolution of own ones; None: never. With coverage = overlap, or max_added, nothing is replaced."""
     own_pixel_steps: int = Field(default=3, ge=0)
     """Gauss-Newton steps on the opacities of imported Gaussians, by the robot's own images; 0: their owners' values."""
     added_need_information: bool = True
@@ -94,3 +97,8 @@ class FusionConfig(Config):
     finetune: FinetuneConfig = FinetuneConfig()
     max_added: int | None = Field(default=None, ge=0)
     """Most Gaussians of peers that are imported, those of most position information first."""
+
+    @property
+    def imports_all(self) -> bool:
+        """Whether all that only peers saw is imported, however much it is."""
+        return self.coverage == "all" and self.max_added is None

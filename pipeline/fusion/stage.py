@@ -17,6 +17,7 @@ from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.consensus.weighting import in_world, self_information
 from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.finest_views import from_finest_views
 from duagc.pipeline.fusion.finetune import finetune_map
 from duagc.pipeline.fusion.fuse import FusedMap, OwnMap, fuse
 from duagc.pipeline.fusion.opacity_update import update_opacities
@@ -196,16 +197,24 @@ def _finetuned(
     if not config.steps_per_view:
         return None
     shown: list[PosedRgbd] = []
+    begun, poses = fused.gaussians, result.T_world_keyframe_of
     if config.peer_share:
-        shown = peer_views(
-            {name: e.select(~valid.contradicted[name]) for name, e in valid.evidence.items()},
-            result.T_world_keyframe_of,
-            context,
-            depth_kinds=result.depth_of,
-            colors=fused.colors,
-        )
+        usable = {name: e.select(~valid.contradicted[name]) for name, e in valid.evidence.items()}
+        shown = peer_views(usable, poses, context, depth_kinds=result.depth_of, colors=fused.colors)
+        factor = context.config.finer
+        if factor is not None and context.config.imports_all:
+            begun = from_finest_views(
+                fused,
+                own.robot,
+                usable,
+                poses,
+                context,
+                factor=factor,
+                depth_images=_depth_images(own),
+                depth_kinds=result.depth_of,
+            )
     trained = None if shown else fused.source == fused.robots.index(own.robot)
-    return finetune_map(fused.gaussians, views, context, trained=trained, peer_views=shown, checkpoints=save)
+    return finetune_map(begun, views, context, trained=trained, peer_views=shown, checkpoints=save)
 
 
 def training_views(

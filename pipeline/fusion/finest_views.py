@@ -1,0 +1,141 @@
+"""Whose Gaussians draw each surface of the final map: those of the robot that saw it at the finest resolution.
+
+Fusion keeps the own Gaussians wherever an own keyframe measured a surface, from however far and however aslant, and
+imports the rest. Where a peer stood nearer, its Gaussians show more than own ones ever can. So the final map begins
+with the own Gaussians, but for those on surfaces that a peer saw at a resolution finer by a factor, and with the
+peer's Gaussians there. The resolution of a camera on a surface is the number of its pixels per meter,
+
+    q = f / z,
+
+z along the optical axis, largest over the keyframes that saw the place: that measured, or whose map draws, a surface
+there or behind it. Peers' keyframes see what the peer's own map draws from there, without what own images contradict.
+Training on own images and on renders of peers' maps follows (`finetune`) and closes the seams.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
+from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces
+from duagc.pipeline.fusion.fuse import FusedMap
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.projection import visible
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import gaussians_of, mean_block
+
+
+def from_finest_views(
+    fused: FusedMap,
+    robot: str,
+    evidence: Mapping[str, Evidence],
+    T_world_keyframe: Mapping[str, Array],
+    context: MapContext,
+    *,
+    factor: float,
+    depth_images: DepthImages,
+    depth_kinds: Mapping[str, DepthKind],
+) -> Gaussians:
+    """The own Gaussians of a fused map, and those of peers where a peer's keyframes saw the surface finer.
+
+    Args:
+        fused: the fused map of the robot.
+        robot: its name.
+        evidence: of the peers, by name, in the world frame, each in its own colors, without what is contradicted.
+        T_world_keyframe: of the robot and its peers, by name, [k, 4, 4] by anchor.
+        context: the robot's own camera and settings.
+        factor: by which a peer's resolution must exceed the own one.
+        depth_images: of own keyframes.
+        depth_kinds: as the peers' maps were made, by name.
+    Returns:
+        Own ids are kept; those of peers' Gaussians follow the largest own one.
+    """
+    own = fused.gaussians.select(np.flatnonzero(fused.source == fused.robots.index(robot)))
+    maps, kinds = {robot: own}, {robot: context.depth_kind, **depth_kinds}
+    for name in sorted(evidence):
+        if len(evidence[name]):
+            theirs = fused.colors[name].of(evidence[name])
+            maps[name] = _as_imported(gaussians_of(theirs.ids, theirs.anchors, theirs.theta), fused, name)
+    if len(maps) < 2:
+        return own
+    means = {name: np.asarray(g.means, dtype=np.float64) for name, g in maps.items()}
+    empty = np.zeros((context.camera.height, context.camera.width), np.float32)
+    found: dict[str, dict[str, Array]] = {name: {} for name in maps}
+    for seen_by, gaussians in maps.items():
+        poses = T_world_keyframe[seen_by]
+        measured = depth_images if seen_by == robot else ((k, empty) for k in range(len(poses)))
+        drawn = known_surfaces(gaussians, poses, measured, replace(context, depth_kind=kinds[seen_by]))
+        finest = finest_resolution(means, poses, drawn, context)
+        for name in maps:
+            found[name][seen_by] = finest[name]
+    parts = [own.select(np.flatnonzero(~_seen_finer(found[robot], robot, factor)))]
+    next_id = int(own.ids.max()) + 1 if len(own) else 0
+    for name in sorted(maps.keys() - {robot}):
+        taken = _belongs(found[name], name, robot, factor)
+        if context.config.added_need_information:
+            taken &= np.trace(mean_block(evidence[name].information), axis1=-2, axis2=-1) > 0
+        rows = np.flatnonzero(taken)
+        parts.append(maps[name].select(rows).replace(ids=next_id + np.arange(len(rows))))
+        next_id += len(rows)
+    return Gaussians.concatenate(parts)
+
+
+def _as_imported(gaussians: Gaussians, fused: FusedMap, owner: str) -> Gaussians:
+    """A peer's Gaussians, those that the fused map imported with the opacities that own images gave them."""
+    imported = np.flatnonzero(fused.source == fused.robots.index(owner))
+    rows = rows_by_id(fused.source_ids[imported], gaussians.ids)
+    logits = gaussians.opacity_logits.copy()
+    logits[rows[rows >= 0]] = fused.gaussians.opacity_logits[imported[rows >= 0]]
+    return gaussians.replace(opacity_logits=logits)
+
+
+def finest_resolution(
+    means: Mapping[str, Array], T_world_keyframe: Array, surfaces: DepthImages, context: MapContext
+) -> dict[str, Array]:
+    """Finest resolution, pixels per meter, at which keyframes of one robot saw each place; 0 of what none saw.
+
+    Args:
+        means: places [n, 3] in the world, meters, by any name.
+        T_world_keyframe: [k, 4, 4], of the keyframes.
+        surfaces: depth of known surfaces by keyframe (`known_surfaces`).
+        context: camera and tolerances.
+    """
+    config, camera = context.config, context.camera
+    finest = {name: np.zeros(len(points)) for name, points in means.items()}
+    for keyframe, depth_m in surfaces:
+        T_camera_world = se3.inverse(T_world_keyframe[keyframe])
+        for name, points in means.items():
+            seen = se3.transform(T_camera_world, points)
+            index, column, row = visible(camera, seen)
+            z, surface_m = seen[index, 2], depth_m[row, column].astype(np.float64)
+            reach_m = surface_m + config.explained_m + config.explained_relative * z
+            saw = (surface_m > 0) & (z <= reach_m)
+            index, z = index[saw], z[saw]
+            finest[name][index] = np.maximum(finest[name][index], camera.fx / z)
+    return finest
+
+
+def _seen_finer(resolution: Mapping[str, Array], robot: str, factor: float) -> NDArray[np.bool_]:
+    """Whether some peer saw the places of own Gaussians finer by the factor; what own keyframes do not tell stays."""
+    peers = [resolution[name] for name in sorted(resolution) if name != robot]
+    own = resolution[robot]
+    return np.asarray((own > 0) & (np.max(peers, axis=0) > factor * own))
+
+
+def _belongs(resolution: Mapping[str, Array], owner: str, robot: str, factor: float) -> NDArray[np.bool_]:
+    """Whether the places of a peer's Gaussians are drawn by it: no other peer saw them as finely, nor did the robot.
+
+    Of peers that saw a place equally the first in order of name draws it.
+    """
+    own = resolution[owner]
+    first = own > factor * resolution[robot]
+    for name in resolution.keys() - {owner, robot}:
+        first &= (own >= resolution[name]) if owner < name else (own > resolution[name])
+    return np.asarray(first)
