@@ -244,6 +244,9 @@ def evaluate(
             help="Also train each own map as long as the final one, without the team, and score it.",
         ),
     ] = False,
+    views: Annotated[
+        int, typer.Option(min=1, help="Most views of a set that maps are scored at, evenly spread.")
+    ] = 40,
     as_json: Json = False,
 ) -> None:
     """Measure a run against ground truth, where there is any, and write metrics.json.
@@ -267,7 +270,7 @@ def evaluate(
 
         longer = train_longer(run, Recording(source), threads)
     with EVALUATION.running(run_folder):
-        metrics = evaluate_run(run_folder, source, threads=threads, own_longer=longer)
+        metrics = evaluate_run(run_folder, source, threads=threads, own_longer=longer, most_views=views)
     if as_json:
         print(json.dumps(metrics, indent=2))
         return

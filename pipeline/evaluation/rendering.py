@@ -20,6 +20,7 @@ from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.evaluation import groundtruth, views
 from duagc.pipeline.evaluation.results import Absent, Row
 from duagc.pipeline.geometry.exposure import ExposureTrack
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
@@ -28,6 +29,8 @@ from duagc.pipeline.splat.gaussians import Gaussians
 
 COMPARED = ("own", "own_longer", "fused", "refined")
 IN_EVERY_RUN = ("own", "fused", "refined")
+MOST_VIEWS = 40
+"""Of a set, unless more are asked for."""
 COMPARED_SETS = ("held_out", "peers", "team")
 NONE_MET = "no robot met another"
 NOT_ASKED = "not asked for: duagc evaluate --own-longer"
@@ -106,8 +109,9 @@ def robot_scores(
     threads: int,
     progress: bool,
     longer: Gaussians | None,
+    most_views: int = MOST_VIEWS,
 ) -> list[Scored]:
-    """Scores of the maps of one robot at all its views, and at those of its peers.
+    """Scores of the maps of one robot at its views, and at those of its peers.
 
     Args:
         run: the run.
@@ -116,6 +120,7 @@ def robot_scores(
         threads: views rendered at the same time; changes no bit of the result.
         progress: show it on standard error.
         longer: its own map, trained longer, in its map frame; None: there is none.
+        most_views: of a set, evenly spread; of peers' views all peers have the same share.
     """
     found: list[Scored] = []
     robot = run.robots[name]
@@ -128,16 +133,18 @@ def robot_scores(
         for index, scores in task.scores(source, threads, title if progress else None):
             found.extend((kind, view_set, index, score) for kind, score in scores.items())
 
-    score(RenderTask(own, robot, "held_out", robot.own_map.depth), "held_out", f"render maps of {name}")
+    task = RenderTask(own, robot, "held_out", robot.own_map.depth, most_views)
+    score(task, "held_out", f"render maps of {name}")
     mapped = {kind: own[kind] for kind in ("own", "fused")}
-    task = RenderTask(mapped, robot, "keyframes", robot.own_map.depth)
+    task = RenderTask(mapped, robot, "keyframes", robot.own_map.depth, most_views)
     score(task, "training", f"render keyframes of {name}")
     world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in COMPARED}
     colors = read_peer_colors(robot.folder / "fused.mcap", name)
-    for peer in mates(run, robot):
+    peers = mates(run, robot)
+    for peer in peers:
         seen = {kind: in_colors_of(colors.get(peer.robot), g) for kind, g in world.items()}
         there = {kind: PosedMap(g, peer.trajectory) for kind, g in seen.items()}
-        task = RenderTask(there, peer, "held_out", robot.own_map.depth)
+        task = RenderTask(there, peer, "held_out", robot.own_map.depth, -(-most_views // len(peers)))
         score(task, "peers", f"render maps of {name} from {peer.robot}")
     return found
 
@@ -202,12 +209,13 @@ def in_colors_of(colors: ColorMap | None, gaussians: Gaussians) -> Gaussians:
 
 @dataclass(frozen=True)
 class RenderTask:
-    """Maps to be rendered where one robot's camera stood: at its held-out frames, or at its keyframes."""
+    """Maps to be rendered where one robot's camera stood: at held-out frames, or at keyframes, evenly spread."""
 
     maps: Mapping[str, PosedMap]
     camera_robot: RobotRun
     view_set: Literal["held_out", "keyframes"]
     depth: DepthKind
+    most: int = MOST_VIEWS
 
     def scores(
         self, source: Recording, threads: int, title: str | None
@@ -215,14 +223,16 @@ class RenderTask:
         """Frame index and the maps' scores of every view, in order; progress under `title`."""
         name, robot = self.camera_robot.robot, self.camera_robot
         keyframes = {k.frame_index for k in robot.keyframes}
-        chosen = robot.held_out if self.view_set == "held_out" else keyframes
+        frames_of_set = sorted(robot.held_out if self.view_set == "held_out" else keyframes)
+        count = min(self.most, len(frames_of_set))
+        chosen = [frames_of_set[k] for k in evenly_spaced(len(frames_of_set), count)]
         with open_rgbd(source.log(name)) as log:
             log.move_depth_by(robot.folder / "frontend.mcap")
             stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}
             exact = groundtruth.exact_depths(source, name, stamps)
             frames = _views(
                 log,
-                sorted(chosen),
+                chosen,
                 exact,
                 recorded_is_exact=groundtruth.recorded_depth_is_exact(source, name),
                 exposures=robot.exposures,

@@ -25,7 +25,13 @@ from duagc.pipeline.evaluation import (
     uncertainty_calibration,
 )
 from duagc.pipeline.evaluation.network import Session
-from duagc.pipeline.evaluation.rendering import Scored, poses_by_stamp, rendering_sections, robot_scores
+from duagc.pipeline.evaluation.rendering import (
+    MOST_VIEWS,
+    Scored,
+    poses_by_stamp,
+    rendering_sections,
+    robot_scores,
+)
 from duagc.pipeline.evaluation.results import (
     Absent,
     Row,
@@ -85,6 +91,7 @@ def evaluate(
     workers: int = 1,
     progress: bool = True,
     own_longer: Mapping[str, Gaussians] | None = None,
+    most_views: int = MOST_VIEWS,
 ) -> dict[str, Any]:
     """Measure a run against its recording and write metrics.json and metrics.parquet into its folder.
 
@@ -96,6 +103,7 @@ def evaluate(
         progress: show it on standard error.
         own_longer: own maps trained as long as the final ones, by robot, to be scored too
             (`experiments.own_longer`).
+        most_views: of a set that maps are scored at, evenly spread.
 
     Returns:
         The content of metrics.json.
@@ -109,7 +117,7 @@ def evaluate(
         raise DuagError(f"{recording}: has no robot {unknown[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
     longer, rows = own_longer or {}, list[Row]()
-    task = _Task(Path(run_dir), Path(recording), threads, progress)
+    task = _Task(Path(run_dir), Path(recording), threads, progress, most_views)
     measured = _measured(task, run, source, truth, workers=workers, own_longer=longer)
     rendering = rendering_sections({name: m.scores for name, m in measured.items()}, longer=bool(longer))
     tree = {
@@ -127,7 +135,7 @@ def evaluate(
         "calibration": _calibration_section(source, measured, rows),
         "exchange": session.exchange_section(),
         "consensus": session.consensus_section(),
-        "protocol": PROTOCOL,
+        "protocol": PROTOCOL | {"views": f"at most {most_views} of a set, evenly spread"},
     }
     metrics, reasons = split_reasons(tree)
     metrics["reasons"] = group_reasons(reasons, run.robots)
@@ -164,6 +172,7 @@ class _Task:
     recording: Path
     threads: int
     progress: bool
+    most_views: int
 
     def in_worker(self, name: str, longer: Gaussians | None) -> RobotMeasures:
         """In a process that knows nothing of the run yet."""
@@ -177,7 +186,15 @@ class _Task:
     ) -> RobotMeasures:
         """In this process."""
         robot = run.robots[name]
-        scores = robot_scores(run, source, name, threads=self.threads, progress=self.progress, longer=longer)
+        scores = robot_scores(
+            run,
+            source,
+            name,
+            threads=self.threads,
+            progress=self.progress,
+            longer=longer,
+            most_views=self.most_views,
+        )
         calibration, rows = _calibration_of(robot, source, truth)
         return RobotMeasures(scores, _agreement_section(robot, source, truth), calibration, rows)
 

@@ -78,7 +78,7 @@ SCHEMA = {
         ("alignment", "ate", "team_ate", "rpe", "depth_agreement", "feature_agreement",
          "initial_relative_poses", "held_out", "peers", "training", "poses",
          "exposure", "colors", "own_unrefined", "own_longer", "refined", "team", "common", "background", "psnr", "ssim",
-         "ms_ssim", "depth", "calibration", "oracle"),
+         "ms_ssim", "depth", "calibration", "oracle", "views"),
         str,
     ),
 }  # fmt: skip
@@ -183,6 +183,20 @@ def test_maps_are_rendered_from_held_out_and_training_views(metrics):
         )  # rounding to 1 mm: 0.25 mm
         assert fused[view_set]["depth_completeness"] == 1.0
         assert own[view_set]["psnr_db"] < fused[view_set]["psnr_db"] - 5  # seen from poses that drift
+
+
+def test_few_views_of_a_set_are_scored_if_asked(metrics, tmp_path):
+    fake = make(tmp_path)
+    asked = evaluate(fake.run, fake.recording, progress=False, most_views=1)
+    for view_set, views in {"held_out": 2, "peers": 2, "training": 2, "team": 4}.items():
+        assert asked["rendering"]["fused"][view_set]["views"] == views
+    rows = pq.read_table(fake.run / "metrics.parquet").to_pylist()
+    assert {r["frame_index"] for r in rows if r["view_set"] == "fused/held_out"} == {
+        12,
+        None,
+    }  # of 4, 12 and 20; None: means
+    assert asked["protocol"]["views"] == "at most 1 of a set, evenly spread"
+    assert asked["team"] == metrics["team"]
 
 
 def test_a_fused_map_shows_what_a_peer_sees(metrics):
