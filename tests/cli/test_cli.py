@@ -21,7 +21,7 @@ from tests.fixtures.recording_logs import write_camera
 
 def test_help_is_there_for_every_command() -> None:
     commands = cli.app.registered_commands
-    names = [c.callback.__name__ for c in commands if c.callback]
+    names = [c.name or c.callback.__name__.replace("_", "-") for c in commands if c.callback]
     assert len(names) >= 10
     text = duagc("--help").stdout
     assert all(name in text for name in names)
