@@ -2,8 +2,8 @@
 
 Fusion keeps the own Gaussians wherever an own keyframe measured a surface, from however far and however aslant, and
 imports the rest. Where a peer stood nearer, its Gaussians show more than own ones ever can. So the final map begins
-with the own Gaussians, but for those on surfaces that a peer saw at a resolution finer by a factor, and with the
-peer's Gaussians there. The resolution of a camera on a surface is the number of its pixels per meter,
+with the fused one, in which the peer's Gaussians replace own ones on surfaces that both saw, and the peer at a
+resolution finer by a factor. The resolution of a camera on a surface is the number of its pixels per meter,
 
     q = f / z,
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces
 from duagc.pipeline.fusion.fuse import FusedMap
@@ -34,51 +34,47 @@ from duagc.pipeline.splat.information import gaussians_of, mean_block
 
 def from_finest_views(
     fused: FusedMap,
-    robot: str,
     evidence: Mapping[str, Evidence],
     T_world_keyframe: Mapping[str, Array],
     context: MapContext,
     *,
+    robot: str,
     factor: float,
     depth_images: DepthImages,
     depth_kinds: Mapping[str, DepthKind],
 ) -> Gaussians:
-    """The own Gaussians of a fused map, and those of peers where a peer's keyframes saw the surface finer.
+    """A fused map with peers' Gaussians in the place of own ones where a peer's keyframes saw the surface finer.
 
     Args:
         fused: the fused map of the robot.
-        robot: its name.
         evidence: of the peers, by name, in the world frame, each in its own colors, without what is contradicted.
         T_world_keyframe: of the robot and its peers, by name, [k, 4, 4] by anchor.
         context: the robot's own camera and settings.
+        robot: its name.
         factor: by which a peer's resolution must exceed the own one.
         depth_images: of own keyframes.
         depth_kinds: as the peers' maps were made, by name.
     Returns:
-        Own ids are kept; those of peers' Gaussians follow the largest own one.
+        Without the own Gaussians that were replaced; ids of what comes in follow the largest of the fused map.
     """
-    own = fused.gaussians.select(np.flatnonzero(fused.source == fused.robots.index(robot)))
-    maps, kinds = {robot: own}, {robot: context.depth_kind, **depth_kinds}
+    own_rows = np.flatnonzero(fused.source == fused.robots.index(robot))
+    maps = {robot: fused.gaussians.select(own_rows)}
     for name in sorted(evidence):
         if len(evidence[name]):
             theirs = fused.colors[name].of(evidence[name])
-            maps[name] = _as_imported(gaussians_of(theirs.ids, theirs.anchors, theirs.theta), fused, name)
-    if len(maps) < 2:
-        return own
-    means = {name: np.asarray(g.means, dtype=np.float64) for name, g in maps.items()}
-    empty = np.zeros((context.camera.height, context.camera.width), np.float32)
-    found: dict[str, dict[str, Array]] = {name: {} for name in maps}
-    for seen_by, gaussians in maps.items():
-        poses = T_world_keyframe[seen_by]
-        measured = depth_images if seen_by == robot else ((k, empty) for k in range(len(poses)))
-        drawn = known_surfaces(gaussians, poses, measured, replace(context, depth_kind=kinds[seen_by]))
-        finest = finest_resolution(means, poses, drawn, context)
-        for name in maps:
-            found[name][seen_by] = finest[name]
-    parts = [own.select(np.flatnonzero(~_seen_finer(found[robot], robot, factor)))]
-    next_id = int(own.ids.max()) + 1 if len(own) else 0
-    for name in sorted(maps.keys() - {robot}):
-        taken = _belongs(found[name], name, robot, factor)
+            maps[name] = gaussians_of(theirs.ids, theirs.anchors, theirs.theta)
+    peers = sorted(maps.keys() - {robot})
+    if not peers:
+        return fused.gaussians
+    found = _resolutions(
+        maps, robot, T_world_keyframe, context=context, depth_images=depth_images, depth_kinds=depth_kinds
+    )
+    kept = np.ones(len(fused.gaussians), bool)
+    kept[own_rows[_seen_finer(found[robot], robot, factor)]] = False
+    parts = [fused.gaussians.select(np.flatnonzero(kept))]
+    next_id = int(fused.gaussians.ids.max()) + 1 if len(fused.gaussians) else 0
+    for name in peers:
+        taken = _belongs(found[name], name, robot, factor) & ~_imported(fused, name, maps[name].ids)
         if context.config.added_need_information:
             taken &= np.trace(mean_block(evidence[name].information), axis1=-2, axis2=-1) > 0
         rows = np.flatnonzero(taken)
@@ -87,13 +83,36 @@ def from_finest_views(
     return Gaussians.concatenate(parts)
 
 
-def _as_imported(gaussians: Gaussians, fused: FusedMap, owner: str) -> Gaussians:
-    """A peer's Gaussians, those that the fused map imported with the opacities that own images gave them."""
-    imported = np.flatnonzero(fused.source == fused.robots.index(owner))
-    rows = rows_by_id(fused.source_ids[imported], gaussians.ids)
-    logits = gaussians.opacity_logits.copy()
-    logits[rows[rows >= 0]] = fused.gaussians.opacity_logits[imported[rows >= 0]]
-    return gaussians.replace(opacity_logits=logits)
+def _resolutions(
+    maps: Mapping[str, Gaussians],
+    robot: str,
+    T_world_keyframe: Mapping[str, Array],
+    *,
+    context: MapContext,
+    depth_images: DepthImages,
+    depth_kinds: Mapping[str, DepthKind],
+) -> dict[str, dict[str, Array]]:
+    """By owner of the Gaussians and by robot that saw them: the finest resolution at each [n]."""
+    means = {name: np.asarray(g.means, dtype=np.float64) for name, g in maps.items()}
+    empty = np.zeros((context.camera.height, context.camera.width), np.float32)
+    exact = context.config.model_copy(
+        update={"explained_px": 0}
+    )  # a peer draws where it is opaque, and not beside
+    found: dict[str, dict[str, Array]] = {name: {} for name in maps}
+    for seen_by, gaussians in maps.items():
+        poses = T_world_keyframe[seen_by]
+        drawn = known_surfaces(gaussians, poses, depth_images, context)
+        if seen_by != robot:
+            theirs = replace(context, config=exact, depth_kind=depth_kinds[seen_by])
+            drawn = known_surfaces(gaussians, poses, ((k, empty) for k in range(len(poses))), theirs)
+        for name, finest in finest_resolution(means, poses, drawn, context).items():
+            found[name][seen_by] = finest
+    return found
+
+
+def _imported(fused: FusedMap, owner: str, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of a peer's Gaussians the fused map has imported."""
+    return np.isin(ids, fused.source_ids[fused.source == fused.robots.index(owner)])
 
 
 def finest_resolution(
@@ -130,12 +149,12 @@ def _seen_finer(resolution: Mapping[str, Array], robot: str, factor: float) -> N
 
 
 def _belongs(resolution: Mapping[str, Array], owner: str, robot: str, factor: float) -> NDArray[np.bool_]:
-    """Whether the places of a peer's Gaussians are drawn by it: no other peer saw them as finely, nor did the robot.
+    """Whether places that the robot saw are drawn by a peer: it saw them finer by the factor, and no other peer finer.
 
     Of peers that saw a place equally the first in order of name draws it.
     """
     own = resolution[owner]
-    first = own > factor * resolution[robot]
+    first = (resolution[robot] > 0) & (own > factor * resolution[robot])
     for name in resolution.keys() - {owner, robot}:
         first &= (own >= resolution[name]) if owner < name else (own > resolution[name])
     return np.asarray(first)

@@ -205,10 +205,10 @@ def _finetuned(
         if factor is not None and context.config.imports_all:
             begun = from_finest_views(
                 fused,
-                own.robot,
                 usable,
                 poses,
                 context,
+                robot=own.robot,
                 factor=factor,
                 depth_images=_depth_images(own),
                 depth_kinds=result.depth_of,

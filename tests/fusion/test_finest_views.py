@@ -23,10 +23,10 @@ def wall(depth_m=2.0):
     return Gaussians(np.arange(n), np.zeros(n), means, turned, shapes, np.full((n, 3), 0.5), np.full(n, 6.0))
 
 
-def at(z_m, x_m=0.0):
+def at(z_m):
     """One keyframe that looks at the wall."""
     T = np.eye(4)[None].copy()
-    T[0, :3, 3] = x_m, 0, z_m
+    T[0, 2, 3] = z_m
     return T
 
 
@@ -39,30 +39,41 @@ def known(name, gaussians, information):
     )
 
 
-def final_map(poses, finer=1.5, walls=None, robot="alpha", information=1.0):
-    """The first Gaussians of a robot's final map, and how many of each peer are in it."""
+def final_map(poses, finer=1.5, walls=None, information=1.0):
+    """Of alpha's final map: the places in alpha's view that its own Gaussians draw, and those that each peer's do."""
     maps = {name: wall() for name in poses} | (walls or {})
     evidence = {n: known(n, g, information) for n, g in maps.items()}
-    config = FusionConfig(finer=finer)
-    origin = np.eye(4)[None]
+    config = FusionConfig(finer=finer, explained_px=0)
+    origin, measured = np.eye(4)[None], [(0, MEASURED_M - np.float32(poses["alpha"][0, 2, 3]))]
     began = fused(
-        OwnMap(robot, maps[robot], origin, origin),
+        OwnMap("alpha", maps["alpha"], origin, origin),
         evidence=evidence,
         T_world_keyframe=dict.fromkeys(poses, origin),
         pairs={},
         config=config,
-        depth_images=[(0, MEASURED_M)],
+        depth_images=measured,
     )
-    return from_finest_views(
+    found = from_finest_views(
         began,
-        robot,
-        {n: e for n, e in evidence.items() if n != robot},
+        {n: e for n, e in evidence.items() if n != "alpha"},
         poses,
         MapContext(CAMERA, config, MATCHING),
+        robot="alpha",
         factor=finer,
-        depth_images=[(0, MEASURED_M - np.float32(poses[robot][0, 2, 3]))],
+        depth_images=measured,
         depth_kinds=dict.fromkeys(poses, "blended"),
     )
+    assert len(np.unique(found.ids)) == len(found)
+    own = found.ids < len(wall())
+    view = seen_from(poses["alpha"])
+    return [places(found.means[rows]) & set(np.flatnonzero(view)) for rows in (own, ~own)]
+
+
+def places(means):
+    """Rows of the wall's Gaussians at some means."""
+    rows = {tuple(xy): row for row, xy in enumerate(wall().means[:, :2].round(4).tolist())}
+    found = [rows[tuple(xy)] for xy in means[:, :2].round(4).tolist()]
+    return set(found)
 
 
 def seen_from(pose):
@@ -72,40 +83,43 @@ def seen_from(pose):
     return (u >= 0) & (u < CAMERA.width) & (v >= 0) & (v < CAMERA.height)
 
 
+IN_VIEW = set(np.flatnonzero(seen_from(at(0.0))))
+
+
 def test_a_peer_that_stood_nearer_draws_what_it_saw():
     poses = {"alpha": at(0.0), "bravo": at(1.0)}
-    found, near = final_map(poses), seen_from(poses["bravo"])
-    n = len(wall())
-    own = found.ids < n
-    np.testing.assert_array_equal(found.ids[own], np.flatnonzero(~near))
-    np.testing.assert_allclose(found.means[~own], wall().means[near], atol=1e-6)
-    np.testing.assert_array_equal(found.ids[~own], n + np.arange(near.sum()))
-    assert 100 < near.sum() < n - 100
+    near = set(np.flatnonzero(seen_from(poses["bravo"])))
+    assert final_map(poses) == [IN_VIEW - near, near]
+    assert 100 < len(near) < len(IN_VIEW) - 100
 
 
 @pytest.mark.parametrize(("z_m", "finer"), [(1.0, 2.5), (0.0, 1.0), (-1.0, 1.0)])
 def test_where_no_peer_saw_finer_the_own_map_stays(z_m, finer):
-    found = final_map({"alpha": at(0.0), "bravo": at(z_m)}, finer)
-    seen = np.flatnonzero(seen_from(at(0.0)))
-    assert np.isin(seen, found.ids).all()
-    theirs = found.means[found.ids >= len(wall())]
-    assert not {tuple(p) for p in theirs} & {tuple(p) for p in wall().means[seen]}
+    assert final_map({"alpha": at(0.0), "bravo": at(z_m)}, finer) == [IN_VIEW, set()]
 
 
-def test_without_information_nothing_is_imported():
-    found = final_map({"alpha": at(0.0), "bravo": at(1.0)}, information=0.0)
-    assert (found.ids < len(wall())).all()
+def test_what_a_peer_has_not_got_stays():
+    """Bravo saw the wall from near, and has sent the left half of it."""
+    left = np.flatnonzero(wall().means[:, 0] < 0)
+    poses = {"alpha": at(0.0), "bravo": at(1.0)}
+    own, theirs = final_map(poses, walls={"bravo": wall().select(left)})
+    assert own | theirs == IN_VIEW
+    assert theirs <= set(left)
+    assert len(theirs) > 50
+
+
+def test_without_information_nothing_comes_in():
+    assert final_map({"alpha": at(0.0), "bravo": at(1.0)}, information=0.0)[1] == set()
 
 
 def test_of_two_peers_the_nearer_draws_and_of_equal_ones_the_first():
-    own, near, nearer = at(0.0), at(0.8), at(1.2)
-    found = final_map({"alpha": own, "bravo": near, "charlie": nearer})
-    assert len(found) == len(wall())  # every place once
-    assert sum(seen_from(near)) > sum(seen_from(nearer))
-    theirs = found.means[found.ids >= len(wall())]
-    assert len(theirs) == sum(seen_from(near))
-    equal = final_map({"alpha": own, "bravo": nearer, "charlie": nearer}, walls={"charlie": wall(1.99)})
-    np.testing.assert_allclose(equal.means[equal.ids >= len(wall()), 2], 2.0)
+    near, nearer = at(0.8), at(1.2)
+    own, theirs = final_map({"alpha": at(0.0), "bravo": near, "charlie": nearer})
+    assert theirs == set(np.flatnonzero(seen_from(near)))
+    assert own == IN_VIEW - theirs
+    empty = wall().select(slice(0, 0))
+    alone = final_map({"alpha": at(0.0), "bravo": nearer, "charlie": nearer}, walls={"charlie": empty})
+    assert final_map({"alpha": at(0.0), "bravo": nearer, "charlie": nearer}) == alone
 
 
 def test_a_place_behind_what_a_keyframe_sees_is_not_seen():
