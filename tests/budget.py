@@ -40,7 +40,7 @@ BUDGET_S = {
     "information": 1,
     "kernels": 26,
     "messages": 1,
-    "posegraph": 16,
+    "posegraph": 15,
     "recording": 14,
     "registration": 5,
     "report": 6,
