@@ -32,6 +32,7 @@ BUDGET_S = {
     "evaluation": 9,
     "examples": 16,
     "exchange": 32,
+    "experiments": 3,
     "frontend": 70,
     "fusion": 2,
     "fuzz": 11,
