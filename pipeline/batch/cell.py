@@ -124,14 +124,23 @@ def _run(suite_path: Path, out: Path, name: str, store: Path) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     workers = max(1, min(2, len(os.sched_getaffinity(0))))
     if folder.exists():
-        plan = RunPlan(workers, store=store)
+        plan = RunPlan(workers, store=store, until=cell.until)
         try:
             if is_up_to_date(Recording(cell.folder), folder, cell.config, plan, log=say):
                 say(f"{folder}: up to date")
                 return
         except DuagError as error:  # the suite is another one than it was; its runs are ours to replace
             say(str(error))
-    run(cell.folder, folder, cell.config, workers=workers, force=folder.exists(), store=store, log=say)
+    run(
+        cell.folder,
+        folder,
+        cell.config,
+        workers=workers,
+        force=folder.exists(),
+        store=store,
+        until=cell.until,
+        log=say,
+    )
 
 
 def enter(arguments: Mapping[str, str], processors: tuple[int, ...] = ()) -> None:

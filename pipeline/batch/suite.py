@@ -16,6 +16,7 @@ from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.config.base import Config, load_config
 from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.run_plan import LAST, NAMES
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.]*")
 
@@ -53,6 +54,9 @@ class SuiteFile(Config):
     exclude: tuple[Exclusion, ...] = ()
     """Cells that are left out."""
 
+    until: str = LAST
+    """Last stage of every run."""
+
 
 @dataclass(frozen=True)
 class BatchCell:
@@ -64,6 +68,7 @@ class BatchCell:
         seed: of the run.
         folder: of the recording.
         config: settings.
+        until: the last stage.
     """
 
     recording: str
@@ -71,6 +76,7 @@ class BatchCell:
     seed: int
     folder: Path
     config: RunConfig
+    until: str = LAST
 
     @property
     def name(self) -> str:
@@ -118,6 +124,8 @@ def read_suite(path: Path) -> Suite:
                 raise DuagError(f"{path}: {kind} {name!r}: expected a name of letters, digits, _ and .")
     if not file.seeds or len(set(file.seeds)) != len(file.seeds):
         raise DuagError(f"{path}: seeds are {list(file.seeds)}, expected different ones, at least one")
+    if file.until not in NAMES:
+        raise DuagError(f"{path}: until {file.until}: is no stage, {closest(file.until, NAMES, 'a stage')}")
     _check_exclusions(path, file)
     cells = {cell.name: cell for cell in _cells(path, file)}
     if not cells:
@@ -163,7 +171,9 @@ def _cells(path: Path, file: SuiteFile) -> Iterator[BatchCell]:
             continue
         settings = None if of_name.file is None else path.parent / of_name.file
         config = load_config(RunConfig, settings, [*of_name.set, f"seed={seed}"])
-        yield BatchCell(recording_name, name, seed, folders[recording_name], config)
+        yield BatchCell(
+            recording_name, name, seed, folder=folders[recording_name], config=config, until=file.until
+        )
 
 
 def _applies(row: Exclusion, cell: Mapping[str, Any]) -> bool:

@@ -98,6 +98,7 @@ def test_a_matrix_has_every_cell_with_its_settings(suite: Suite) -> None:
             "losy: .* expected perhaps lossy",
         ),
         ("configurations.plain", 'configurations."a/b"', "expected a name of letters"),
+        ("seeds", 'until = "evaluate"\nseeds', "until evaluate: is no stage, expected perhaps evaluation"),
         ("[recordings]", "[recordings", "not valid TOML"),
     ],
 )
