@@ -140,13 +140,6 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             _LOGS,
             "runs exchange evaluation report",
         ),
-        _part(
-            "experiments",
-            "research that no run depends on",
-            _MATHEMATICS,
-            _LOGS,
-            "posegraph network consensus exchange frontend fusion runs evaluation bench team_posegraph converters",
-        ),
     ),
     (
         _part(
@@ -197,6 +190,16 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "batch",
             "many runs at once",
             "base config recording cache comparison run_plan existing_run runner",
+        ),
+    ),
+    (
+        _part(
+            "experiments",
+            "claims and research that no run depends on",
+            _MATHEMATICS,
+            _LOGS,
+            "posegraph network consensus exchange frontend fusion runs evaluation bench team_posegraph converters",
+            "batch report",
         ),
     ),
     (_part("replay", "computes a robot again", "base config runs recording exchange steps"),),

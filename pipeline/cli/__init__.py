@@ -12,6 +12,7 @@ from duagc.pipeline.cli.common import EXIT_FAILED, app
 from duagc.pipeline.cli import recordings
 from duagc.pipeline.cli import runs
 from duagc.pipeline.cli import batch
+from duagc.pipeline.cli import experiment
 from duagc.pipeline.cli import compare
 from duagc.pipeline.cli import inspect
 from duagc.pipeline.cli import posegraph
@@ -25,6 +26,7 @@ __all__ = [
     "batch",
     "bench",
     "compare",
+    "experiment",
     "inspect",
     "main",
     "posegraph",

@@ -313,3 +313,29 @@ def robustness(rows: Sequence[Mapping[str, Any]]) -> Figure:
     panels[0].invert_yaxis()
     panels[1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
+
+
+@_styled
+def margins(rules: Sequence[Mapping[str, Any]]) -> Figure:
+    """Paired differences against margins, a row for each rule, in units of its margin.
+
+    Args:
+        rules: "name", "gaps" (of the seeds), "interval" (low, mean, high; NaN if unknown), "bounds" that the mean must
+            pass, "word" (the verdict).
+    """
+    figure, axes = _figure(9.6, 1.0 + 0.42 * max(1, len(rules)))
+    colors = {"holds": COLORS[2], "fails": COLORS[1]}
+    for k, rule in enumerate(rules):
+        color = colors.get(rule["word"], FAINT)
+        for bound in rule["bounds"]:
+            axes.plot([bound, bound], [k - 0.35, k + 0.35], color=INK, linewidth=1.2)
+        low, middle, high = rule["interval"]
+        axes.plot([low, high], [k, k], color=color, linewidth=3.0, alpha=0.5, solid_capstyle="butt")
+        axes.plot([middle], [k], marker="D", color=color, markersize=6, linestyle="none")
+        axes.plot(rule["gaps"], [k + 0.2] * len(rule["gaps"]), ".", color=FAINT, markersize=5)
+    axes.set_yticks(range(len(rules)), [rule["name"] for rule in rules])
+    axes.set_ylim(len(rules) - 0.5, -0.5)
+    axes.set_xscale("symlog", linthresh=2.0)
+    axes.set_xlabel("difference in units of the margin; positive: the first side is better")
+    axes.grid(visible=False, axis="y")
+    return figure

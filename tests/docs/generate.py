@@ -22,6 +22,15 @@ from duagc.pipeline.cli import app
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.checks import ChecksConfig
 from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.experiments.rule import (
+    ExperimentFile,
+    Metric,
+    Profile,
+    Rule,
+    RuleConfiguration,
+    RuleSide,
+    SimulatedData,
+)
 from duagc.schemas import topics
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -118,6 +127,9 @@ def config_page() -> str:
         "`duagc check` takes these with `--set times.gap_ratio=2` or `--config FILE`; no run depends on them.\n"
     )
     parts += list(_sections(ChecksConfig(), ""))
+    parts.append("## Rules of an experiment\n\nWhat stands in a file that `duagc experiment` reads.\n")
+    for kind in (ExperimentFile, Profile, SimulatedData, RuleConfiguration, Metric, Rule, RuleSide):
+        parts += [f"### {kind.__name__}\n", f"{(kind.__doc__ or '').strip()}\n", _table_of(kind)]
     return "\n".join(parts)
 
 

@@ -1,0 +1,140 @@
+"""The commands that decide claims by rules that were written before."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli.common import EXIT_DIFFERENT, StoreFolder, app, say
+
+experiment_app = typer.Typer(
+    no_args_is_help=True, help="Claims, decided by rules that are written before the run."
+)
+app.add_typer(experiment_app, name="experiment")
+
+
+@experiment_app.command("list")
+def list_experiments() -> None:
+    """List the experiments with their titles.
+
+    Example: `duagc experiment list`
+    """
+    from duagc.pipeline.experiments.rule import experiment_names, read_experiment
+
+    names = experiment_names()
+    width = max(map(len, names), default=0)
+    for name in names:
+        print(f"{name:<{width}}  {read_experiment(name).file.title}")
+
+
+@experiment_app.command()
+def show(
+    name: Annotated[str, typer.Argument(help="Of the experiment.", show_default=False)],
+) -> None:
+    """Print the file of an experiment: question, configurations, rules, margins.
+
+    Example: `duagc experiment show h1_team`
+    """
+    from duagc.pipeline.experiments.rule import read_experiment
+
+    found = read_experiment(name)
+    print(f"# {found.name}, sha256 {found.sha256}")
+    for profile, of in found.file.profiles.items():
+        cells = len(of.seeds) * len(found.file.configurations)
+        print(f"# {profile}: {len(of.seeds)} recordings, {cells} runs")
+    print(found.path.read_text(encoding="utf-8"), end="")
+
+
+@experiment_app.command()
+def run(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Experiments.", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder of all experiments; goes on where it was stopped.")
+    ] = Path("outputs/experiments"),
+    everything: Annotated[bool, typer.Option("--all", help="Every experiment.")] = False,
+    profile: Annotated[str, typer.Option(help="small or full.")] = "small",
+    recording: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FOLDER", help="A recording to run as well; repeatable.", show_default=False
+        ),
+    ] = None,
+    engine: Annotated[str, typer.Option(help="local, slurm (extra `slurm`), ray (extra `ray`).")] = "local",
+    workers: Annotated[int, typer.Option(min=1, help="Runs at the same time, each with its processors.")] = 1,
+    store: StoreFolder = None,
+) -> None:
+    """Run experiments and write their page: every configuration, on a recording that each seed draws.
+
+    Everything that the rules name is looked at before anything runs. Recordings are simulated once and shared by
+    experiments; all runs share a store. A run that fails is tried again once; the exit code is 3 then. The page is
+    `index.html`.
+
+    Examples: `duagc experiment run --all --out outputs/experiments`,
+    `duagc experiment run h1_team --recording kitchen=recordings/redkitchen --out outputs/h1`
+    """
+    from duagc.pipeline.batch.engines import engine_of
+    from duagc.pipeline.cache.store import default_store
+    from duagc.pipeline.experiments.carry_out import carry_out, check_place, check_recordings
+    from duagc.pipeline.experiments.pages import PAGE, judge_folder, write_report
+    from duagc.pipeline.experiments.rule import experiment_names, read_experiment
+
+    if engine not in ("local", "slurm", "ray"):
+        raise typer.BadParameter(f"{engine!r} is not one of local, slurm, ray", param_hint="--engine")
+    if bool(names) == everything:
+        raise typer.BadParameter("expected names of experiments, or --all", param_hint="NAME")
+    chosen = [read_experiment(name) for name in (experiment_names() if everything else names or [])]
+    recordings = dict(_named_folder(text) for text in recording or ())
+    for experiment in chosen:
+        experiment.profile(profile)
+        check_place(experiment, profile, out)
+    check_recordings(chosen, recordings)
+    failed = []
+    for experiment in chosen:
+        with engine_of(engine, workers, out / experiment.name) as opened:
+            failed += carry_out(
+                experiment,
+                profile,
+                out,
+                recordings=recordings,
+                engine=opened,
+                store=store or default_store(out / "run"),
+                log=say,
+            )
+    write_report(out, judge_folder(out))
+    print(f"page       {out / PAGE}")
+    if failed:
+        say(f"{len(failed)} runs failed: {', '.join(failed)}")
+        raise typer.Exit(EXIT_DIFFERENT)
+
+
+@experiment_app.command()
+def report(
+    out: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of all experiments.", show_default=False)
+    ],
+) -> None:
+    """Judge the results in a folder and write their page; a result made under another rule is refused.
+
+    Writes `index.html`, `experiments.md` and `verdicts.json`.
+
+    Example: `duagc experiment report outputs/experiments`
+    """
+    from duagc.pipeline.experiments.pages import PAGE, judge_folder, write_report
+
+    judged = judge_folder(out)
+    write_report(out, judged)
+    for one in judged:
+        for verdict in one.verdicts:
+            kind = "control" if verdict.rule.control else "rule"
+            print(f"{one.experiment.name}  {kind} {verdict.rule.name}: {verdict.word} ({verdict.why})")
+    print(f"page       {out / PAGE}")
+
+
+def _named_folder(text: str) -> tuple[str, Path]:
+    name, separator, folder = text.partition("=")
+    if not separator or not name or not folder:
+        raise DuagError(f"--recording {text}: expected NAME=FOLDER")
+    return name, Path(folder)

@@ -1,0 +1,257 @@
+"""Carry out an experiment: simulate its recordings once, run its cells as a batch, keep what its rules need."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from duagc.converters.simulate.team import simulate
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file, read_text
+from duagc.pipeline.batch.batch import run_batch
+from duagc.pipeline.batch.cell import read_state, run_folder
+from duagc.pipeline.batch.engines import Engine
+from duagc.pipeline.batch.results import gather
+from duagc.pipeline.batch.suite import BatchCell, Suite, read_suite
+from duagc.pipeline.evaluation.results import reason_of
+from duagc.pipeline.experiments.metric_names import names_in, needs_truth
+from duagc.pipeline.experiments.rule import Experiment, Profile, SimulatedData, config_of
+from duagc.pipeline.experiments.statistics import mean
+from duagc.pipeline.experiments.verdicts import ResultRow
+from duagc.pipeline.recording import Recording
+
+RESULT, SUITE, RECORDINGS = "result.json", "suite.toml", "recordings"
+UNTIL = "evaluation"
+
+
+def check_recordings(experiments: Sequence[Experiment], recordings: Mapping[str, Path]) -> None:
+    """Refuse recordings with a name that is taken, that cannot be opened, or that lack ground truth that is needed.
+
+    Args:
+        experiments: that will be run.
+        recordings: folders by name.
+
+    Raises:
+        DuagError: names the recording, what it lacks and what needs it.
+    """
+    for name, folder in recordings.items():
+        if not re.fullmatch(r"(?!seed_)[A-Za-z0-9_.]+", name):
+            raise DuagError(f"--recording {name}: expected letters, digits, _ and ., and no seed_ in front")
+        recording = Recording(folder)
+        without = [robot for robot in recording.robots if recording.groundtruth(robot) is None]
+        for experiment in experiments if without else ():
+            needed = next((name for name in experiment.file.metrics if needs_truth(name)), None)
+            if needed is not None:
+                raise DuagError(
+                    f"{folder}: has no ground truth of {without[0]}, "
+                    f"expected it for metric {needed} of {experiment.name}"
+                )
+
+
+def check_place(experiment: Experiment, profile: str, out: Path) -> None:
+    """Refuse to mix results of two rules, or of two profiles, in one folder.
+
+    Args:
+        experiment: that will be run.
+        profile: its name.
+        out: folder of all experiments.
+
+    Raises:
+        DuagError: another rule or profile has been there.
+    """
+    path = out / experiment.name / RESULT
+    if not path.is_file():
+        return
+    earlier = read_result(path)
+    check_rule(experiment, earlier, path)
+    if earlier["profile"] != profile:
+        raise DuagError(
+            f"{path}: is of profile {earlier['profile']}, expected {profile}; choose another --out"
+        )
+
+
+def check_rule(experiment: Experiment, result: Mapping[str, Any], path: Path) -> None:
+    """Refuse a result that was made under another rule.
+
+    Args:
+        experiment: as its file is now.
+        result: as it was written.
+        path: of the result.
+
+    Raises:
+        DuagError: the digests differ.
+    """
+    if result["rule_sha256"] != experiment.sha256:
+        raise DuagError(
+            f"{path}: was made under rule {str(result['rule_sha256'])[:12]}, expected {experiment.sha256[:12]} "
+            f"of {experiment.name}; run it again into another --out"
+        )
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """What an experiment came to.
+
+    Args:
+        path: of its file.
+
+    Raises:
+        DuagError: it is none.
+    """
+    try:
+        found = json.loads(read_text(path, "the result of an experiment"))
+        if {"rule_sha256", "profile", "rows", "seeds", "recordings"} <= found.keys():
+            return dict(found)
+    except (ValueError, AttributeError):
+        pass
+    raise DuagError(f"{path}: is no result of an experiment, expected what `duagc experiment run` writes")
+
+
+def recording_folder(out: Path, data: SimulatedData, seed: int) -> Path:
+    """Folder of a simulated recording; experiments with the same data share it.
+
+    Args:
+        out: folder of all experiments.
+        data: what is simulated.
+        seed: of it.
+    """
+    digest = hashlib.sha256(data.model_dump_json().encode()).hexdigest()[:12]
+    return out / RECORDINGS / f"{digest}-{seed}"
+
+
+def prepare(
+    experiment: Experiment,
+    profile: Profile,
+    out: Path,
+    *,
+    recordings: Mapping[str, Path],
+    log: Callable[[str], None],
+) -> Suite:
+    """Simulate the recordings that are missing, and write the suite of all cells.
+
+    Args:
+        experiment: that will be run.
+        profile: how much is computed.
+        out: folder of all experiments.
+        recordings: of the user, folders by name.
+        log: gets a line for every recording that is simulated.
+
+    Raises:
+        DuagError: a recording cannot be read.
+    """
+    folders = dict[str, Path]()
+    for seed in profile.seeds:
+        folder = recording_folder(out, profile.data, seed)
+        folders[_simulated_name(seed)] = folder
+        if not folder.exists():
+            log(f"simulate: {profile.data.robots} robots, {profile.data.frames} frames each, seed {seed}")
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            settings = {k: v for k, v in profile.data.model_dump().items() if k not in ("width", "height")}
+            size = (profile.data.width, profile.data.height)
+            simulate(folder, size=size, seed=seed, **settings)
+    for name, folder in recordings.items():
+        folders[name] = folder.resolve()
+    path = out / experiment.name / SUITE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with new_file(path) as part:
+        part.write_text(_suite_text(experiment, profile, folders, path.parent), encoding="utf-8")
+    return read_suite(path)
+
+
+def _simulated_name(seed: int) -> str:
+    return f"seed_{seed}"
+
+
+def _suite_text(experiment: Experiment, profile: Profile, folders: Mapping[str, Path], base: Path) -> str:
+    """Every simulated recording with the run's seed that is its own; real ones with the first seed."""
+    lines = [f"seeds = {list(profile.seeds)}", f'until = "{UNTIL}"', "[recordings]"]
+    lines += [f"{name} = {json.dumps(os.path.relpath(folder, base))}" for name, folder in folders.items()]
+    for name in experiment.file.configurations:
+        settings = config_of(experiment.file, profile, name)
+        lines += [f"[configurations.{name}]", f"set = {json.dumps(settings)}"]
+    own = {_simulated_name(seed): seed for seed in profile.seeds}
+    for name in folders:
+        for seed in profile.seeds:
+            if seed != own.get(name, profile.seeds[0]):
+                lines += ["[[exclude]]", f'recording = "{name}"', f"seed = {seed}"]
+    return "\n".join(lines) + "\n"
+
+
+def carry_out(
+    experiment: Experiment,
+    profile: str,
+    out: Path,
+    *,
+    recordings: Mapping[str, Path],
+    engine: Engine,
+    store: Path,
+    log: Callable[[str], None],
+) -> list[str]:
+    """Run an experiment and write its result.
+
+    Args:
+        experiment: the experiment.
+        profile: name of how much is computed.
+        out: folder of all experiments.
+        recordings: of the user, folders by name.
+        engine: where the cells run.
+        store: of what was computed before.
+        log: gets progress.
+
+    Returns:
+        Names of the cells that failed.
+
+    Raises:
+        DuagError: what a user can fix.
+    """
+    chosen = experiment.profile(profile)
+    suite = prepare(experiment, chosen, out, recordings=recordings, log=log)
+    folder = out / experiment.name
+    run_batch(suite, folder, store, engine, log=lambda line: log(f"{experiment.name}: {line}"))
+    done = gather(suite, folder)
+    rows = [_row(experiment, cell, folder, done.get(cell.name, {})) for cell in suite.cells.values()]
+    document = {
+        "experiment": experiment.name,
+        "rule_sha256": experiment.sha256,
+        "profile": profile,
+        "seeds": list(chosen.seeds),
+        "recordings": list(recordings),
+        "rows": [asdict(row) for row in rows],
+    }
+    with new_file(folder / RESULT) as part:
+        part.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return [name for name in suite.cells if name not in done]
+
+
+def _row(experiment: Experiment, cell: BatchCell, folder: Path, numbers: Mapping[str, object]) -> ResultRow:
+    """The metrics that the experiment names, of one cell."""
+    values, reasons = dict[str, float | None](), dict[str, str]()
+    failure = read_state(folder, cell.name).error
+    for metric in experiment.file.metrics:
+        found = [numbers[name] for name in names_in(metric, numbers)]
+        known = [float(value) for value in found if isinstance(value, int | float)]
+        values[metric] = mean(known) if known and len(known) == len(found) else None
+        if values[metric] is None:
+            reasons[metric] = failure or _reason(run_folder(folder, cell.name), metric)
+    recording = "" if cell.recording == _simulated_name(cell.seed) else cell.recording
+    return ResultRow(recording, cell.configuration, cell.seed, values, reasons)
+
+
+def _reason(run: Path, metric: str) -> str:
+    """Why the run has no such metric, as it says itself."""
+    path = run / "metrics.json"
+    grouped = json.loads(read_text(path, "the metrics of a run")).get("reasons", {}) if path.is_file() else {}
+    return reason_of(grouped, metric) or next(_matching(grouped, metric), "the run does not have it")
+
+
+def _matching(grouped: Mapping[str, Sequence[str]], metric: str) -> Iterator[str]:
+    """Reasons of names that a metric with `*` stands for."""
+    for reason, patterns in grouped.items():
+        if any(fnmatchcase(pattern, metric) for pattern in patterns):
+            yield reason

@@ -1,0 +1,219 @@
+"""The page of all experiments in a folder: verdicts, tables, differences, plots, and the command of each."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
+from duagc.pipeline.base.random_streams import generator
+from duagc.pipeline.base.templates import filled
+from duagc.pipeline.experiments.carry_out import RESULT, check_rule, read_result
+from duagc.pipeline.experiments.rule import RULES, Experiment, Metric, Rule, read_experiment
+from duagc.pipeline.experiments.statistics import bca_interval, mean
+from duagc.pipeline.experiments.verdicts import (
+    PairedGaps,
+    ResultRow,
+    RuleVerdict,
+    compare,
+    judge,
+    margin_of,
+    rows_of,
+)
+from duagc.pipeline.report import figures
+
+PAGE, MARKDOWN, VERDICTS, FIGURE = "index.html", "experiments.md", "verdicts.json", "rules.svg"
+KINDS = {"better": "better", "no_worse": "no worse", "equivalent": "equal", "differs": "different"}
+
+
+@dataclass(frozen=True)
+class JudgedExperiment:
+    """An experiment with its result.
+
+    Attributes:
+        experiment: the experiment.
+        result: what stands in its file.
+        rows: its runs.
+        verdicts: of its rules.
+    """
+
+    experiment: Experiment
+    result: dict[str, Any]
+    rows: list[ResultRow]
+    verdicts: list[RuleVerdict]
+
+
+def judge_folder(out: Path, rules: Path = RULES) -> list[JudgedExperiment]:
+    """Judge every result in a folder by the rule under which it was made.
+
+    Args:
+        out: folder of all experiments.
+        rules: folder of their files.
+
+    Raises:
+        DuagError: there is no result, or one was made under another rule.
+    """
+    paths = sorted(out.glob(f"*/{RESULT}"))
+    if not paths:
+        raise DuagError(f"{out}: found no {RESULT}, expected what `duagc experiment run` writes")
+    judged = []
+    for path in paths:
+        result = read_result(path)
+        experiment = read_experiment(path.parent.name, rules)
+        check_rule(experiment, result, path)
+        rows = rows_of(result)
+        judged.append(
+            JudgedExperiment(experiment, result, rows, judge(experiment.name, experiment.file, rows))
+        )
+    return judged
+
+
+def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
+    """Write page, Markdown, verdicts and figures of experiments.
+
+    Args:
+        out: folder of all experiments.
+        judged: experiments with their results.
+    """
+    sections = [_section(one) for one in judged]
+    for one, section in zip(judged, sections, strict=True):
+        _write(out / one.experiment.name / FIGURE, section["figure"])
+    package = "duagc.pipeline.experiments"
+    _write(out / PAGE, filled(package, "page.html.j2", title="Experiments", sections=sections))
+    _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, sections=sections))
+    verdicts = {one.experiment.name: [_document(v) for v in one.verdicts] for one in judged}
+    _write(out / VERDICTS, json.dumps(verdicts, indent=2, allow_nan=False) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
+    with new_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def _document(verdict: RuleVerdict) -> dict[str, Any]:
+    numbers = {name: getattr(verdict, name) for name in ("mean", "low", "high", "p", "p_exact")}
+    return {
+        "rule": verdict.rule.name,
+        "control": verdict.rule.control,
+        "verdict": verdict.word,
+        "why": verdict.why,
+        "margin": margin_of(verdict.rule),
+        "gaps": {str(seed): gap for seed, gap in verdict.gaps.items()},
+        **{name: value if math.isfinite(value) else None for name, value in numbers.items()},
+    }
+
+
+def _section(one: JudgedExperiment) -> dict[str, Any]:
+    file, name, profile = one.experiment.file, one.experiment.name, one.result["profile"]
+    controls = [v for v in one.verdicts if v.rule.control]
+    data = file.profiles[profile].data
+    return {
+        "name": name,
+        "title": file.title,
+        "question": file.question,
+        "claim": file.claim,
+        "limits": file.limits,
+        "sha256": one.experiment.sha256,
+        "profile": profile,
+        "level": f"{file.level:g}",
+        "seeds": ", ".join(map(str, one.result["seeds"])),
+        "data": f"{data.robots} robots, {data.frames} frames of {data.width}x{data.height} each, "
+        f"scene {data.scene}, overlap {data.overlap:g}, noise {data.noise}",
+        "command": f"duagc experiment run {name} --profile {profile} --out DIR",
+        "controls": len(controls),
+        "controls_wrong": [v.rule.name for v in controls if not v.as_expected],
+        "verdicts": [_verdict_row(v, file.metrics[v.rule.first.metric]) for v in one.verdicts],
+        "metrics": [
+            metric.title + (f" ({metric.unit})" if metric.unit else "") for metric in file.metrics.values()
+        ],
+        "configurations": [_configuration_row(one, row) for row in file.configurations],
+        "recordings": [
+            {"name": recording, "rows": [_recording_row(one, rule, recording) for rule in file.rules]}
+            for recording in one.result["recordings"]
+        ],
+        "figure": figures.margins([_drawn(v) for v in one.verdicts]),
+    }
+
+
+def _verdict_row(verdict: RuleVerdict, metric: Metric) -> dict[str, Any]:
+    rule = verdict.rule
+    known = math.isfinite(verdict.mean)
+    return {
+        "name": rule.name,
+        "claim": rule.claim,
+        "control": rule.control,
+        "word": verdict.word,
+        "why": verdict.why,
+        "reason": rule.reason,
+        "first": _side(rule, first=True),
+        "second": _side(rule, first=False),
+        "test": KINDS[rule.kind]
+        + (f", margin {_size(rule, metric, margin_of(rule), sign='')}" if rule.margin else ""),
+        "mean": _size(rule, metric, verdict.mean) if known else "–",
+        "interval": f"{_size(rule, metric, verdict.low)} to {_size(rule, metric, verdict.high)}"
+        if known
+        else "–",
+        "gaps": ", ".join(_size(rule, metric, gap) for gap in verdict.gaps.values()),
+        "p": f"{verdict.p:.2g}" if known else "–",
+        "p_exact": f"{verdict.p_exact:.2g}" if known else "–",
+    }
+
+
+def _side(rule: Rule, *, first: bool) -> str:
+    """A side of a rule: configuration and metric, without what both have in common."""
+    side, other = (rule.first, rule.second) if first else (rule.second, rule.first)
+    if side.configuration == other.configuration:
+        return side.metric
+    return side.configuration if side.metric == other.metric else f"{side.configuration}: {side.metric}"
+
+
+def _size(rule: Rule, metric: Metric, gap: float, sign: str = "+") -> str:
+    """A difference in the unit of its metric, or a quotient in percent; positive where the first side is better."""
+    if rule.ratio:
+        return f"{100 * math.expm1(gap):{sign}.1f} %"
+    return f"{gap * metric.scale:{sign}.{metric.digits}f} {metric.unit}".rstrip()
+
+
+def _configuration_row(one: JudgedExperiment, configuration: str) -> dict[str, Any]:
+    """Mean and interval of every metric over the simulated recordings."""
+    file, cells = one.experiment.file, []
+    for name, metric in file.metrics.items():
+        found = [r.values.get(name) for r in one.rows if not r.recording and r.configuration == configuration]
+        values = [value for value in found if value is not None]
+        if not values:
+            cells.append({"value": "–", "interval": "", "lost": len(found)})
+            continue
+        stream = generator(0, "experiment", experiment=one.experiment.name, row=configuration, metric=name)
+        low, high = bca_interval(values, stream) if len(values) > 1 else (values[0], values[0])
+        shown = [f"{x * metric.scale:.{metric.digits}f}" for x in (mean(values), low, high)]
+        interval = f"{shown[1]} to {shown[2]}" if len(values) > 1 else ""
+        cells.append({"value": shown[0], "interval": interval, "lost": len(found) - len(values)})
+    settings = ", ".join(file.configurations[configuration].set)
+    return {"name": configuration, "settings": settings, "cells": cells}
+
+
+def _recording_row(one: JudgedExperiment, rule: Rule, recording: str) -> dict[str, str]:
+    """A real recording is one: its differences are shown, and decide nothing."""
+    found: PairedGaps = compare(rule, one.experiment.file, one.rows, recording)
+    metric = one.experiment.file.metrics[rule.first.metric]
+    shown = [_size(rule, metric, gap) for gap in found.gaps.values()]
+    return {"name": rule.name, "claim": rule.claim, "value": ", ".join(shown or list(found.missing.values()))}
+
+
+def _drawn(verdict: RuleVerdict) -> dict[str, Any]:
+    """A verdict for the plot: differences in units of the margin, and the bounds that the mean must pass."""
+    rule, margin = verdict.rule, margin_of(verdict.rule)
+    unit = margin or max(map(abs, verdict.gaps.values()), default=1.0) or 1.0
+    bounds = {"better": (margin / unit,), "no_worse": (-1.0,), "equivalent": (-1.0, 1.0), "differs": (0.0,)}
+    return {
+        "name": rule.name + (" (control)" if rule.control else ""),
+        "gaps": [gap / unit for gap in verdict.gaps.values()],
+        "interval": [x / unit for x in (verdict.low, verdict.mean, verdict.high)],
+        "bounds": bounds[rule.kind],
+        "word": verdict.word,
+    }

@@ -1,0 +1,161 @@
+"""Experiments are read whole before anything runs; what they name exists."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.experiments.metric_names import KNOWN, names_in, needs_truth
+from duagc.pipeline.experiments.rule import RULES, experiment_names, read_experiment
+from tests.fixtures import fake_run
+from tests.fixtures.commands import assert_one_line, duagc_here
+from tests.layers import ROOT
+
+FILE = """
+title = "a"
+question = "b"
+claim = "c"
+limits = "d"
+[profiles.small]
+seeds = [0, 1, 2, 3, 4]
+data = { robots = 2, frames = 2, width = 32, height = 32 }
+[configurations.plain]
+[configurations.lossy]
+set = ["exchange.link.loss_probability=0.3"]
+[metrics."team.ate_rmse_m"]
+title = "ATE"
+better = "less"
+[metrics."exchange.rounds"]
+title = "rounds"
+better = "less"
+[[rules]]
+name = "poses"
+claim = "equal"
+kind = "equivalent"
+first = { configuration = "lossy", metric = "team.ate_rmse_m" }
+second = { configuration = "plain", metric = "team.ate_rmse_m" }
+margin = 0.001
+reason = "small"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "mine.toml").write_text(FILE)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", experiment_names())
+def test_every_experiment_of_the_package_can_be_read_and_has_a_control(name: str) -> None:
+    found = read_experiment(name)
+    assert any(rule.control for rule in found.file.rules)
+    assert all(len(profile.seeds) >= 5 for profile in found.file.profiles.values())
+    assert set(found.file.profiles) == {"small", "full"}
+
+
+def test_the_digest_is_that_of_the_bytes(folder: Path) -> None:
+    before = read_experiment("mine", folder)
+    (folder / "mine.toml").write_text(FILE + "\n# a word\n")
+    assert read_experiment("mine", folder).sha256 != before.sha256
+    assert read_experiment("mine", folder).file == before.file
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        (
+            '"team.ate_rmse_m"]',
+            '"team.ate_rms_m"]',
+            "metric team.ate_rms_m is unknown, expected perhaps team.ate_rmse_m",
+        ),
+        (
+            "loss_probability",
+            "loss_probabilty",
+            "configuration lossy: .* expected perhaps exchange.link.loss_probab",
+        ),
+        (
+            'configuration = "lossy"',
+            'configuration = "losy"',
+            "rule poses: configuration losy .* perhaps lossy",
+        ),
+        (
+            'metric = "team.ate_rmse_m" }\nsecond',
+            'metric = "exchange.bytes_sent" }\nsecond',
+            "is not in the file",
+        ),
+        ('configuration = "lossy"', 'configuration = "plain"', "team.ate_rmse_m of plain with itself"),
+        ("margin = 0.001", "", "margin is 0, expected above 0 for equivalent"),
+        ('kind = "equivalent"', 'kind = "differs"', "margin is 0.001, expected none for differs"),
+        ('kind = "equivalent"', 'kind = "equal"', "rules.0.kind"),
+        ("[0, 1, 2, 3, 4]", "[0, 0]", "seeds: 0 occurs twice"),
+        ("[0, 1, 2, 3, 4]", "[]", "profile small: found no seed"),
+        ("frames = 2", "frames = 1", "frames is 1, expected 2"),
+        ("frames = 2", "frame = 2", "data.frame"),
+        ("[[rules]]", "[[rules]", "not valid TOML"),
+    ],
+)
+def test_what_does_not_exist_is_one_line(folder: Path, old: str, new: str, complaint: str) -> None:
+    assert old in FILE
+    (folder / "mine.toml").write_text(FILE.replace(old, new))
+    with pytest.raises(DuagError, match=complaint):
+        read_experiment("mine", folder)
+
+
+def test_metrics_of_two_kinds_are_not_compared(folder: Path) -> None:
+    text = FILE.replace('title = "ATE"', 'title = "ATE"\nunit = "m"')
+    text = text.replace('plain", metric = "team.ate_rmse_m"', 'plain", metric = "exchange.rounds"')
+    (folder / "mine.toml").write_text(text)
+    with pytest.raises(DuagError, match="expected metrics of one kind"):
+        read_experiment("mine", folder)
+
+
+def test_the_known_metrics_are_those_of_a_run() -> None:
+    """Of the golden demo, which has all of them but those of truth that no simulation lacks."""
+    golden = json.loads((ROOT / "tests" / "golden" / "demo.json").read_text(encoding="utf-8"))["metrics"]
+    numbers = {name: value for name, value in golden.items() if isinstance(value, int | float)}
+    absent = {name for name in KNOWN if not names_in(name, golden)}
+    assert absent == set()
+    for section in ("team.", "exchange.", "calibration."):
+        assert {name for name in numbers if name.startswith(section)} <= set(KNOWN)
+    assert names_in("robots.*.ate_rmse_m", numbers) == ["robots.alpha.ate_rmse_m", "robots.bravo.ate_rmse_m"]
+
+
+def test_the_metrics_of_truth_are_known() -> None:
+    assert needs_truth("team.ate_rmse_m")
+    assert needs_truth("robots.*.rpe_rot_rad")
+    assert needs_truth("calibration.spearman")
+    assert not needs_truth("rendering.own.held_out.psnr_db")
+    assert not needs_truth("consensus.rounds_to_tolerance")
+
+
+def test_the_commands_name_what_there_is(tmp_path: Path) -> None:
+    said = duagc_here("experiment", "list").stdout
+    assert [line.split()[0] for line in said.splitlines()] == experiment_names()
+    shown = duagc_here("experiment", "show", "h1_team").stdout
+    assert shown.endswith((RULES / "h1_team.toml").read_text())
+    assert read_experiment("h1_team").sha256 in shown
+    assert_one_line(duagc_here("experiment", "show", "h1_tean"), "expected perhaps h1_team")
+    assert duagc_here("experiment", "run", "--out", tmp_path).returncode == 2
+    assert_one_line(
+        duagc_here("experiment", "run", "h1_team", "--profile", "medium", "--out", tmp_path), "small"
+    )
+    assert_one_line(duagc_here("experiment", "report", tmp_path), "found no result.json")
+
+
+def test_a_recording_without_truth_is_refused_before_anything_runs(tmp_path: Path) -> None:
+    fake = fake_run.make(tmp_path / "fake")
+    for path in fake.recording.rglob("*groundtruth*"):
+        path.unlink()
+    described = json.loads((fake.recording / "recording.json").read_text())
+    for robot in described["robots"].values():
+        robot.pop("groundtruth", None)
+    (fake.recording / "recording.json").write_text(json.dumps(described))
+    out = tmp_path / "out"
+    given = f"wall={fake.recording}"
+    result = duagc_here("experiment", "run", "h1_team", "--recording", given, "--out", out)
+    assert_one_line(result, "has no ground truth of", "expected it for metric robots.*.ate_rmse_m")
+    assert not out.exists()
+    assert_one_line(
+        duagc_here("experiment", "run", "h1_team", "--recording", "wall", "--out", out), "NAME=FOLDER"
+    )
