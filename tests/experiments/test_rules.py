@@ -156,6 +156,11 @@ def test_a_recording_without_truth_is_refused_before_anything_runs(tmp_path: Pat
     result = duagc_here("experiment", "run", "h1_team", "--recording", given, "--out", out)
     assert_one_line(result, "has no ground truth of", "expected it for metric robots.*.ate_rmse_m")
     assert not out.exists()
-    assert_one_line(
-        duagc_here("experiment", "run", "h1_team", "--recording", "wall", "--out", out), "NAME=FOLDER"
-    )
+    for text, said in (
+        ("wall", "NAME=FOLDER"),
+        (f"a/b={fake.recording}", "expected letters"),
+        (f"seed_1={fake.recording}", "no seed_ in front"),
+        (f"there={tmp_path / 'nowhere'}", "nowhere/recording.json"),
+    ):
+        assert_one_line(duagc_here("experiment", "run", "h1_team", "--recording", text, "--out", out), said)
+    assert not out.exists()
