@@ -127,7 +127,7 @@ def _section(one: JudgedExperiment) -> dict[str, Any]:
         "command": f"duagc experiment run {name} --profile {profile} --out DIR",
         "controls": len(controls),
         "controls_wrong": [v.rule.name for v in controls if not v.as_expected],
-        "verdicts": [_verdict_row(v, file.metrics[v.rule.first.metric]) for v in one.verdicts],
+        "verdicts": [_verdict_row(v, file.metrics[v.rule.metric]) for v in one.verdicts],
         "metrics": [
             metric.title + (f" ({metric.unit})" if metric.unit else "") for metric in file.metrics.values()
         ],
@@ -167,6 +167,8 @@ def _verdict_row(verdict: RuleVerdict, metric: Metric) -> dict[str, Any]:
 def _side(rule: Rule, *, first: bool) -> str:
     """A side of a rule: configuration and metric, without what both have in common."""
     side, other = (rule.first, rule.second) if first else (rule.second, rule.first)
+    if side.value is not None:
+        return f"{side.value:g}"
     if side.configuration == other.configuration:
         return side.metric
     return side.configuration if side.metric == other.metric else f"{side.configuration}: {side.metric}"
@@ -200,7 +202,7 @@ def _configuration_row(one: JudgedExperiment, configuration: str) -> dict[str, A
 def _recording_row(one: JudgedExperiment, rule: Rule, recording: str) -> dict[str, str]:
     """A real recording is one: its differences are shown, and decide nothing."""
     found: PairedGaps = compare(rule, one.experiment.file, one.rows, recording)
-    metric = one.experiment.file.metrics[rule.first.metric]
+    metric = one.experiment.file.metrics[rule.metric]
     shown = [_size(rule, metric, gap) for gap in found.gaps.values()]
     return {"name": rule.name, "claim": rule.claim, "value": ", ".join(shown or list(found.missing.values()))}
 

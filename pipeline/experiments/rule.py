@@ -87,10 +87,12 @@ class Metric(Config):
 
 
 class RuleSide(Config):
-    """One side of a comparison."""
+    """One side of a comparison: a metric of a configuration, or a number."""
 
-    configuration: str
-    metric: str
+    configuration: str = ""
+    metric: str = ""
+    value: float | None = None
+    """A bound that the other side is compared with; then there is neither configuration nor metric."""
 
 
 class Rule(Config):
@@ -103,7 +105,7 @@ class Rule(Config):
     equivalent: both within the margin, by two one-sided tests; differs: not zero."""
     first: RuleSide
     second: RuleSide
-    """What the first is compared with: on the same recording, with the same seed."""
+    """What the first is compared with: on the same recording, with the same seed. One of both may be a number."""
     margin: float = Field(default=0.0, ge=0.0)
     """In the unit of the metric; of `ratio`, a share: 0.05 is 5 %."""
     ratio: bool = False
@@ -112,6 +114,11 @@ class Rule(Config):
     """A claim that is known to be false: if it holds, the other verdicts of this experiment are worthless."""
     reason: str
     """Why this margin."""
+
+    @property
+    def metric(self) -> str:
+        """The metric in whose unit the sides are compared."""
+        return self.second.metric if self.first.value is not None else self.first.metric
 
 
 class ExperimentFile(Config):
@@ -234,7 +241,13 @@ def _check(path: Path, file: ExperimentFile) -> None:
 
 
 def _check_rule(where: str, rule: Rule, file: ExperimentFile) -> None:
+    sides = [side for side in (rule.first, rule.second) if side.value is None]
+    if not sides:
+        raise DuagError(f"{where}: compares two numbers, expected at least one metric")
     for side in (rule.first, rule.second):
+        if side.value is not None and (side.configuration or side.metric):
+            raise DuagError(f"{where}: a side has a value and a metric, expected one of both")
+    for side in sides:
         check_metric(side.metric, where)
         for kind, name, known in (
             ("configuration", side.configuration, list(file.configurations)),
@@ -244,7 +257,7 @@ def _check_rule(where: str, rule: Rule, file: ExperimentFile) -> None:
                 raise DuagError(
                     f"{where}: {kind} {name} is not in the file, {closest(name, known, f'a {kind}')}"
                 )
-    first, second = (file.metrics[side.metric] for side in (rule.first, rule.second))
+    first, second = (file.metrics[side.metric] for side in (sides[0], sides[-1]))
     if (first.better, first.unit, first.scale) != (second.better, second.unit, second.scale):
         raise DuagError(
             f"{where}: compares {rule.first.metric} with {rule.second.metric}, expected metrics of one kind"

@@ -97,9 +97,12 @@ def compare(rule: Rule, file: ExperimentFile, rows: Sequence[ResultRow], recordi
     """
     at = {(row.configuration, row.seed): row for row in rows if row.recording == recording}
     gaps, missing = dict[int, float](), dict[int, str]()
-    sign = 1.0 if file.metrics[rule.first.metric].better == "more" else -1.0
+    sign = 1.0 if file.metrics[rule.metric].better == "more" else -1.0
     for seed in sorted({seed for _, seed in at}):
-        pair = [_value(at.get((side.configuration, seed)), side) for side in (rule.first, rule.second)]
+        pair = [
+            _value(at.get((side.configuration, seed)), side) if side.value is None else side.value
+            for side in (rule.first, rule.second)
+        ]
         absent = [value for value in pair if isinstance(value, str)]
         if absent:
             missing[seed] = absent[0]
@@ -110,7 +113,7 @@ def compare(rule: Rule, file: ExperimentFile, rows: Sequence[ResultRow], recordi
         elif min(first, second) > 0:
             gaps[seed] = sign * math.log(first / second)
         else:
-            missing[seed] = f"{rule.first.metric} is {min(first, second):g}, of which there is no ratio"
+            missing[seed] = f"{rule.metric} is {min(first, second):g}, of which there is no ratio"
     return PairedGaps(gaps, missing)
 
 

@@ -85,6 +85,7 @@ def test_the_digest_is_that_of_the_bytes(folder: Path) -> None:
             "is not in the file",
         ),
         ('configuration = "lossy"', 'configuration = "plain"', "team.ate_rmse_m of plain with itself"),
+        ('{ configuration = "lossy", metric', "{ value = 1.0, metric", "a side has a value and a metric"),
         ("margin = 0.001", "", "margin is 0, expected above 0 for equivalent"),
         ('kind = "equivalent"', 'kind = "differs"', "margin is 0.001, expected none for differs"),
         ('kind = "equivalent"', 'kind = "equal"', "rules.0.kind"),

@@ -79,6 +79,20 @@ def test_quotients_are_of_the_side_that_is_compared_with() -> None:
     assert "of which there is no ratio" in none.why
 
 
+def test_a_side_may_be_a_number() -> None:
+    """Less is better: at most 0.9 is shown of values about 0.8, and at least 0.7 by turning the sides."""
+    at_most = {"kind": "better", "second": {"value": 0.9}}
+    at_least = {"kind": "better", "first": {"value": 0.7}, "second": {"configuration": "a", "metric": METRIC}}
+    near = [0.81, 0.79, 0.80, 0.805, 0.80]
+    assert one(at_most, [*near], []).word == one(at_least, [*near], []).word == "holds"
+    assert one(at_most, [x + 0.2 for x in near], []).word == "fails"
+    assert one(at_least, [x - 0.2 for x in near], []).word == "fails"
+    within = {"kind": "equivalent", "second": {"value": 0.8}, "margin": 0.02}
+    assert one(within, [*near], []).word == "holds"
+    assert one(within, [x + 0.03 for x in near], []).word == "fails"
+    assert one(at_most, [None, *near[1:]], []).word == "not testable here"
+
+
 def test_five_seeds_cannot_show_a_difference_of_either_sign() -> None:
     verdict = one({"kind": "differs"}, moved(0.5), [*BASE])
     assert verdict.word == "not testable here"
