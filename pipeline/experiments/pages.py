@@ -177,7 +177,8 @@ def _side(rule: Rule, *, first: bool) -> str:
 def _size(rule: Rule, metric: Metric, gap: float, sign: str = "+") -> str:
     """A difference in the unit of its metric, or a quotient in percent; positive where the first side is better."""
     if rule.ratio:
-        return f"{100 * math.expm1(gap):{sign}.1f} %"
+        percent = 100 * math.expm1(gap)
+        return f"{percent:{sign}.1f} %" if abs(percent) >= 0.1 else f"{percent:{sign}.1g} %"
     return f"{gap * metric.scale:{sign}.{metric.digits}f} {metric.unit}".rstrip()
 
 
@@ -190,7 +191,7 @@ def _configuration_row(one: JudgedExperiment, configuration: str) -> dict[str, A
         if not values:
             cells.append({"value": "–", "interval": "", "lost": len(found)})
             continue
-        stream = generator(0, "experiment", experiment=one.experiment.name, row=configuration, metric=name)
+        stream = generator(0, "experiment", metric=name)  # equal values have equal intervals in all rows
         low, high = bca_interval(values, stream) if len(values) > 1 else (values[0], values[0])
         shown = [f"{x * metric.scale:.{metric.digits}f}" for x in (mean(values), low, high)]
         interval = f"{shown[1]} to {shown[2]}" if len(values) > 1 else ""

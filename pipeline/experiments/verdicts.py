@@ -153,7 +153,8 @@ def _tested(name: str, rule: Rule, file: ExperimentFile, found: PairedGaps) -> R
     lost = "".join(f"; seed {seed}: {why}" for seed, why in found.missing.items())
     least = least_sign_flip_p(len(gaps)) * (2 if rule.kind == "differs" else 1)
     if len(gaps) < 2 or least > file.level:
-        why = f"{len(gaps)} pairs, of which the exact test cannot reach {file.level:g}{lost}"
+        pairs = "1 pair" if len(gaps) == 1 else f"{len(gaps)} pairs"
+        why = f"{pairs}, of which the exact test cannot reach {file.level:g}{lost}"
         return RuleVerdict(rule, "not testable here", why, found.gaps)
     p, p_exact = _p_values(rule, gaps)
     low, high = bca_interval(gaps, generator(0, "experiment", experiment=name, rule=rule.name))

@@ -53,4 +53,4 @@ def test_an_experiment_computed_twice_is_the_same(rules: Path, tmp_path: Path) -
     judged = judge_folder(tmp_path / "a", rules)
     assert judged[0].verdicts[0].word == "not testable here", "one seed shows nothing"
     write_report(tmp_path / "a", judged)
-    assert "1 pairs, of which the exact test cannot reach 0.05" in (tmp_path / "a" / PAGE).read_text()
+    assert "1 pair, of which the exact test cannot reach 0.05" in (tmp_path / "a" / PAGE).read_text()
