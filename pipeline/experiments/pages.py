@@ -26,6 +26,7 @@ from duagc.pipeline.experiments.verdicts import (
     rows_of,
 )
 from duagc.pipeline.report import figures
+from duagc.pipeline.report.pictures import svg_uri
 
 PAGE, MARKDOWN, VERDICTS, FIGURE = "index.html", "experiments.md", "verdicts.json", "rules.svg"
 KINDS = {"better": "better", "no_worse": "no worse", "equivalent": "equal", "differs": "different"}
@@ -112,6 +113,7 @@ def _section(one: JudgedExperiment) -> dict[str, Any]:
     file, name, profile = one.experiment.file, one.experiment.name, one.result["profile"]
     controls = [v for v in one.verdicts if v.rule.control]
     data = file.profiles[profile].data
+    drawn = figures.margins([_drawn(v) for v in one.verdicts])
     return {
         "name": name,
         "title": file.title,
@@ -136,7 +138,8 @@ def _section(one: JudgedExperiment) -> dict[str, Any]:
             {"name": recording, "rows": [_recording_row(one, rule, recording) for rule in file.rules]}
             for recording in one.result["recordings"]
         ],
-        "figure": figures.margins([_drawn(v) for v in one.verdicts]),
+        "figure": drawn,
+        "figure_uri": svg_uri(drawn),
     }
 
 

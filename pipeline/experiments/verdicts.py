@@ -189,19 +189,25 @@ def _decided(verdict: RuleVerdict, level: float) -> RuleVerdict:
     lost = verdict.why
     if verdict.p <= level and verdict.p_exact <= level:
         return replace(verdict, word="holds", why=f"both tests reject the contrary{lost}")
-    return replace(verdict, why=f"{_contrary(verdict)}{lost}")
+    return replace(verdict, why=f"{_contrary(verdict, level)}{lost}")
 
 
-def _contrary(verdict: RuleVerdict) -> str:
-    """Whether the contrary is likely, or these seeds do not decide."""
-    margin, rule = margin_of(verdict.rule), verdict.rule
-    if rule.kind == "better" and verdict.high < margin:
-        return "the whole interval lies below the margin"
-    if rule.kind in ("no_worse", "equivalent") and verdict.high < -margin:
-        return "the whole interval is worse by more than the margin"
-    if rule.kind == "equivalent" and verdict.low > margin:
-        return "the whole interval is better by more than the margin"
-    return f"not shown by {len(verdict.gaps)} seeds"
+def _contrary(verdict: RuleVerdict, level: float) -> str:
+    """Whether both tests show the contrary of the claim, or these seeds do not decide."""
+    margin, kind = margin_of(verdict.rule), verdict.rule.kind
+    gaps = list(verdict.gaps.values())
+    turned = [-gap for gap in gaps]
+
+    def shown(values: list[float], bound: float) -> bool:
+        return max(t_test_p(values, bound), sign_flip_p(values, bound)) <= level
+
+    if kind == "better" and shown(turned, -margin):
+        return "the contrary is shown: less than the margin"
+    if kind in ("no_worse", "equivalent") and shown(turned, margin):
+        return "the contrary is shown: worse by more than the margin"
+    if kind == "equivalent" and shown(gaps, margin):
+        return "the contrary is shown: better by more than the margin"
+    return f"not shown by {len(gaps)} seeds, and neither is the contrary"
 
 
 def rows_of(document: Mapping[str, Any]) -> list[ResultRow]:

@@ -323,6 +323,8 @@ def margins(rules: Sequence[Mapping[str, Any]]) -> Figure:
         rules: "name", "gaps" (of the seeds), "interval" (low, mean, high; NaN if unknown), "bounds" that the mean must
             pass, "word" (the verdict).
     """
+    from matplotlib.ticker import FuncFormatter
+
     figure, axes = _figure(9.6, 1.0 + 0.42 * max(1, len(rules)))
     colors = {"holds": COLORS[2], "fails": COLORS[1]}
     for k, rule in enumerate(rules):
@@ -336,6 +338,7 @@ def margins(rules: Sequence[Mapping[str, Any]]) -> Figure:
     axes.set_yticks(range(len(rules)), [rule["name"] for rule in rules])
     axes.set_ylim(len(rules) - 0.5, -0.5)
     axes.set_xscale("symlog", linthresh=2.0)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axes.set_xlabel("difference in units of the margin; positive: the first side is better")
     axes.grid(visible=False, axis="y")
     return figure

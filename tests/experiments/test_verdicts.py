@@ -65,7 +65,9 @@ def moved(by: float) -> list[float | None]:
 )
 def test_a_rule_knows_its_margin(kind: str, by: float, word: str) -> None:
     """Less is better, the margin is 0.1."""
-    assert one({"kind": kind, "margin": 0.1}, moved(by), [*BASE]).word == word
+    verdict = one({"kind": kind, "margin": 0.1}, moved(by), [*BASE])
+    assert verdict.word == word
+    assert ("the contrary is shown" in verdict.why) == (word == "fails" and by != -0.1)
 
 
 def test_quotients_are_of_the_side_that_is_compared_with() -> None:
@@ -107,7 +109,7 @@ def test_a_seed_against_the_claim_is_heard_by_the_exact_test() -> None:
     verdict = one({"kind": "better"}, a, b)
     assert verdict.p < 0.05 < verdict.p_exact
     assert verdict.word == "fails"
-    assert "not shown by 5 seeds" in verdict.why
+    assert "not shown by 5 seeds, and neither is the contrary" in verdict.why
 
 
 def test_absent_values_are_no_pairs_and_say_why() -> None:
