@@ -179,6 +179,7 @@ def _side(rule: Rule, *, first: bool) -> str:
 
 def _size(rule: Rule, metric: Metric, gap: float, sign: str = "+") -> str:
     """A difference in the unit of its metric, or a quotient in percent; positive where the first side is better."""
+    gap += 0.0  # no minus before a zero
     if rule.ratio:
         percent = 100 * math.expm1(gap)
         return f"{percent:{sign}.1f} %" if abs(percent) >= 0.1 else f"{percent:{sign}.1g} %"

@@ -150,7 +150,10 @@ def judge(name: str, file: ExperimentFile, rows: Sequence[ResultRow]) -> list[Ru
 def _tested(name: str, rule: Rule, file: ExperimentFile, found: PairedGaps) -> RuleVerdict:
     """With p values, which are not yet adjusted."""
     gaps = list(found.gaps.values())
-    lost = "".join(f"; seed {seed}: {why}" for seed, why in found.missing.items())
+    lost = "".join(
+        f"; seeds {', '.join(str(seed) for seed, other in found.missing.items() if other == why)}: {why}"
+        for why in dict.fromkeys(found.missing.values())
+    )
     least = least_sign_flip_p(len(gaps)) * (2 if rule.kind == "differs" else 1)
     if len(gaps) < 2 or least > file.level:
         pairs = "1 pair" if len(gaps) == 1 else f"{len(gaps)} pairs"

@@ -116,8 +116,8 @@ def test_absent_values_are_no_pairs_and_say_why() -> None:
     verdict = one({"kind": "better"}, [None, *moved(-0.2)[1:]], [*BASE])
     assert verdict.word == "not testable here"
     assert "4 pairs" in verdict.why
-    assert "seed 0: team.ate_rmse_m of a: nobody met" in verdict.why
-    assert one({"kind": "better"}, [], [*BASE]).why.endswith("seed 4: the run of a is missing")
+    assert "; seeds 0: team.ate_rmse_m of a: nobody met" in verdict.why
+    assert one({"kind": "better"}, [], [*BASE]).why.endswith("; seeds 0, 1, 2, 3, 4: the run of a is missing")
 
 
 def test_the_family_is_adjusted_and_controls_stand_apart() -> None:
