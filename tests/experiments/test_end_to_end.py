@@ -27,7 +27,8 @@ def rules(tmp_path: Path) -> Path:
     folder.mkdir()
     text = FILE.replace("[0, 1, 2, 3, 4]", "[1]")
     text = text.replace(
-        "frames = 2, width = 32, height = 32 }", "frames = 12, width = 160, height = 120 }" + SETTINGS
+        "frames = 2, width = 32, height = 32 }",
+        "frames = 12, width = 160, height = 120 }" + SETTINGS,
     )
     (folder / "mine.toml").write_text(text)
     return folder
@@ -53,4 +54,8 @@ def test_an_experiment_computed_twice_is_the_same(rules: Path, tmp_path: Path) -
     judged = judge_folder(tmp_path / "a", rules)
     assert judged[0].verdicts[0].word == "not testable here", "one seed shows nothing"
     write_report(tmp_path / "a", judged)
-    assert "1 pair, of which the exact test cannot reach 0.05" in (tmp_path / "a" / PAGE).read_text()
+    page = (tmp_path / "a" / PAGE).read_text()
+    assert "0 pairs, of which the exact test cannot reach 0.05" in page
+    assert "a joint alignment needs at least 2 robots" in page, (
+        "what the run says itself: 12 frames join no team"
+    )
