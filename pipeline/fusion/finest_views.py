@@ -97,7 +97,7 @@ def _resolutions(
     empty = np.zeros((context.camera.height, context.camera.width), np.float32)
     exact = context.config.model_copy(
         update={"explained_px": 0}
-    )  # a peer draws where it is opaque, and not beside
+    )  # a peer draws where it is opaque, not next to it
     found: dict[str, dict[str, Array]] = {name: {} for name in maps}
     for seen_by, gaussians in maps.items():
         poses = T_world_keyframe[seen_by]
