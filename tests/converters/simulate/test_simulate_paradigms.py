@@ -76,6 +76,7 @@ def test_paths_are_smooth_clear_and_overlap_as_asked(room, paradigm, robots, ove
     assert paradigms.least_apart(ways) >= figures.APART_M
 
 
+@pytest.mark.slow
 def test_who_asks_for_too_many_is_told_how_many_fit(stage, monkeypatch):
     monkeypatch.setattr(paradigms, "DRAWS", 8)
     kind = {"frames": 60, "overlap": 0.5, "camera": CAMERA, "seed": 0}
@@ -95,6 +96,7 @@ def test_an_overlap_that_cannot_be_is_the_nearest_one_and_said(folder, tmp_path)
     assert re.fullmatch(r"neighbors share 0\.\d\d of the view \(.*\), expected 1\.00", warning)
 
 
+@pytest.mark.slow
 def test_a_survey_plans_the_same_figure_again_and_says_what_was_reached(room, monkeypatch):
     again: list[list[np.ndarray]] = []
 
