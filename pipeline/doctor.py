@@ -15,7 +15,7 @@ from typing import Literal
 
 from duagc import __version__
 from duagc.pipeline.base.determinism import SETTINGS
-from duagc.pipeline.base.machine import memory_bytes
+from duagc.pipeline.base.machine import memory_bytes, processors
 
 REQUIRED = {
     "numpy": "numpy",
@@ -103,7 +103,7 @@ def _kernels() -> Found:
 
 
 def _machine() -> Iterator[Found]:
-    usable, all_of_them = len(os.sched_getaffinity(0)), os.cpu_count() or 1
+    usable, all_of_them = processors(), os.cpu_count() or 1
     share = _processor_share()
     limited = f", limited to {share:g} of them" if share is not None and share < usable else ""
     yield Found("processors", "ok", f"{usable} of {all_of_them} usable{limited}")

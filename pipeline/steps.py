@@ -6,13 +6,13 @@ here and all that it imports stay the same. So imports are inside the functions.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.component_names import component_name
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.machine import processors
 
 if TYPE_CHECKING:
     from duagc.pipeline.base.checkpoints import Checkpoints
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def threads_per_worker(workers: int) -> int:
     """Threads of each of `workers` processes on this machine."""
-    return max(1, len(os.sched_getaffinity(0)) // workers)
+    return max(1, processors() // workers)
 
 
 def calibration(recording: Recording, folder: Path, config: RunConfig, *, workers: int) -> dict[str, Any]:

@@ -81,12 +81,10 @@ class TimeLeft:
             for name, size in robots.items()
         }
         self._later = self._units([*(work.size for work in self.robots.values()), *found.values()], wanted)
-        self._now: tuple[str, float, float] | None = (
-            None  # stage that this process does, predicted, since when
-        )
-        self._taken: dict[
-            str, tuple[float, float]
-        ] = {}  # measured and predicted seconds of stages that are done
+        # stage that this process does, predicted seconds, since when
+        self._now: tuple[str, float, float] | None = None
+        # measured and predicted seconds of stages that are done
+        self._taken: dict[str, tuple[float, float]] = {}
 
     @staticmethod
     def _guess(size: Size) -> int:

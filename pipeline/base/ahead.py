@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 from typing import TypeVar
+
+from duagc.pipeline.base.machine import processors
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -27,7 +28,7 @@ def in_order(
         items: read by the caller's thread only.
         threads: how many; None: as many as this process may use.
     """
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or processors()
     waiting: deque[Future[Result]] = deque()
     left = iter(items)
     with ThreadPoolExecutor(threads) as pool:

@@ -26,6 +26,11 @@ def memory_bytes() -> tuple[int | None, int | None]:
     return total, free
 
 
+def processors() -> int:
+    """Processors that this process may use; every thread of a core is one."""
+    return len(os.sched_getaffinity(0))
+
+
 def cores() -> int:
     """Cores that this process may use; the threads of one core count once."""
     usable = os.sched_getaffinity(0)

@@ -18,6 +18,7 @@ from typing import Literal
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.machine import processors
 
 RUNS, CELLS = "runs", "cells"
 State = Literal["waiting", "running", "done", "failed"]
@@ -122,7 +123,7 @@ def _run(suite_path: Path, out: Path, name: str, store: Path) -> None:
     cell = read_suite(suite_path).cells[name]
     folder = run_folder(out, name)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    workers = max(1, min(2, len(os.sched_getaffinity(0))))
+    workers = max(1, min(2, processors()))
     if folder.exists():
         plan = RunPlan(workers, store=store, until=cell.until)
         try:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.machine import processors
 from duagc.pipeline.base.open3d_import import import_open3d
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.base.workers import peak_memory_bytes, worker_pool
@@ -111,7 +112,7 @@ def run(plan: Plan) -> dict[str, Any]:
         "schema": SCHEMA,
         "machine": {
             "cpu": cpu_name(),
-            "cores": len(os.sched_getaffinity(0)),
+            "cores": processors(),
             "threads": plan.threads,
             "load_average": os.getloadavg()[0],
         },

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from duagc.pipeline.base.machine import processors
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.bench import torch_tiles
 from duagc.pipeline.config.training import LossConfig
@@ -173,7 +174,7 @@ class Peaks:
         """What ran all this, and the peaks; keys of the inner dictionaries are numbers of threads."""
         return {
             "cpu": cpu_name(),
-            "cores": len(os.sched_getaffinity(0)),
+            "cores": processors(),
             "isas": list(self.fma_gflops),
             **vars(self),
         }

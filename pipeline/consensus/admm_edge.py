@@ -92,9 +92,7 @@ class AdmmEdge:
     adapting_from: float = 0.0  # received_total when the robust weights became final after their schedule
     newest: NDArray[np.int64] = field(init=False)  # [s] sequence last used
     newest_header: int = 0
-    active: NDArray[np.bool_] = field(
-        init=False
-    )  # [s] shared keyframes that some loop closure with weight names
+    active: NDArray[np.bool_] = field(init=False)  # [s] named by some loop closure with weight
     active_version: int = 0  # of the mask
     changes: Array = field(init=False)  # [s, REMEMBERED] by the last arrivals (m, rad), the newest last
     reference: tuple[Array, Array] | None = None  # force and poses when the curvature window began

@@ -32,7 +32,7 @@ IN_EVERY_RUN = ("own", "fused", "refined")
 MOST_VIEWS = 40
 """Of a set, unless more are asked for."""
 COMPARED_SETS = ("held_out", "peers", "team")
-NONE_MET = "no robot met another"
+NONE_MET = "no robot met another, or the settings train no final map"
 NOT_ASKED = "not asked for: duagc evaluate --own-longer"
 REASONS = {
     "held_out": "there is no such view",

@@ -95,14 +95,14 @@ def _resolutions(
     """By owner of the Gaussians and by robot that saw them: the finest resolution at each [n]."""
     means = {name: np.asarray(g.means, dtype=np.float64) for name, g in maps.items()}
     empty = np.zeros((context.camera.height, context.camera.width), np.float32)
-    exact = context.config.model_copy(
-        update={"explained_px": 0}
-    )  # a peer draws where it is opaque, not next to it
+    # a peer draws where it is opaque, not next to it
+    exact = context.config.model_copy(update={"explained_px": 0})
     found: dict[str, dict[str, Array]] = {name: {} for name in maps}
     for seen_by, gaussians in maps.items():
         poses = T_world_keyframe[seen_by]
-        drawn = known_surfaces(gaussians, poses, depth_images, context)
-        if seen_by != robot:
+        if seen_by == robot:
+            drawn = known_surfaces(gaussians, poses, depth_images, context)
+        else:
             theirs = replace(context, config=exact, depth_kind=depth_kinds[seen_by])
             drawn = known_surfaces(gaussians, poses, ((k, empty) for k in range(len(poses))), theirs)
         for name, finest in finest_resolution(means, poses, drawn, context).items():

@@ -53,9 +53,8 @@ def agreeing(
     )
     T = graduated(RelativePoses.concatenate(chains), between, T, config)
     keep = least_squares.squared_residuals(between, T) <= config.truncation**2
-    if np.count_nonzero(keep) < np.count_nonzero(
-        start.keep
-    ):  # a start is no worse than its own loop closures
+    # a start is no worse than its own loop closures
+    if np.count_nonzero(keep) < np.count_nonzero(start.keep):
         keep = start.keep
     T_own_peer = np.array([c.T_own_peer for c in closures], dtype=np.float64)
     frames = own.T_frame_keyframe[i] @ T_own_peer @ se3.inverse(peer.T_frame_keyframe[j])

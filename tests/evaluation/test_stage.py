@@ -3,13 +3,16 @@
 import json
 import shutil
 from fnmatch import fnmatchcase
+from inspect import signature
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli.runs import evaluate as evaluate_command
 from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.evaluation.rendering import MOST_VIEWS
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.experiments.own_longer import own_longer
 from duagc.pipeline.recording import LogWriter, Recording, read_log
@@ -191,12 +194,15 @@ def test_few_views_of_a_set_are_scored_if_asked(metrics, tmp_path):
     for view_set, views in {"held_out": 2, "peers": 2, "training": 2, "team": 4}.items():
         assert asked["rendering"]["fused"][view_set]["views"] == views
     rows = pq.read_table(fake.run / "metrics.parquet").to_pylist()
-    assert {r["frame_index"] for r in rows if r["view_set"] == "fused/held_out"} == {
-        12,
-        None,
-    }  # of 4, 12 and 20; None: means
+    scored = {r["frame_index"] for r in rows if r["view_set"] == "fused/held_out"}
+    assert scored == {12, None}  # of 4, 12 and 20; None: means
     assert asked["protocol"]["views"] == "at most 1 of a set, evenly spread"
     assert asked["team"] == metrics["team"]
+
+
+def test_the_command_scores_as_many_views_as_a_run():
+    command = signature(evaluate_command).parameters["views"].default
+    assert command == signature(evaluate).parameters["most_views"].default == MOST_VIEWS
 
 
 def test_a_fused_map_shows_what_a_peer_sees(metrics):
