@@ -97,35 +97,46 @@ def fitted_psnr(
     height, width = image.shape[:2]
     counted = np.ones((height, width), dtype=bool) if valid is None else valid
     covered = counted & (render.alpha >= MIN_ALPHA)
+    whole = bool(counted.all())
     halves = (slice(0, width // 2), slice(width // 2, width))
+    color, alpha = render.color.astype(np.float64), render.alpha.astype(np.float64)[..., None]
     errors = []
     for scored, other in (halves, halves[::-1]):
-        squares = _squared_errors(render, image, scored, other, covered=covered)
+        squares = _squared_errors((color, alpha, image), scored, other, covered=covered)
         if isinstance(squares, Absent):
             return squares
-        errors.append(squares[counted[:, scored]])
+        errors.append(squares.reshape(-1, 3) if whole else squares[counted[:, scored]])
     if not all(len(error) for error in errors):
         return Absent("half of the image has no valid pixel")
     return FittedPsnr(_psnr(errors[0]), _psnr(errors[1]), _psnr(np.concatenate(errors)))
 
 
 def _squared_errors(
-    render: Rendered, image: Array, scored: slice, fitted: slice, *, covered: NDArray[np.bool_]
+    images: tuple[Array, Array, Array], scored: slice, fitted: slice, *, covered: NDArray[np.bool_]
 ) -> Array | Absent:
-    """Squared errors [h, w', 3] of the scored columns in the exposure of the fitted columns."""
+    """Squared errors [h, w', 3] of the scored columns in the exposure of the fitted columns.
+
+    Args:
+        images: rendered colors [h, w, 3] and opacity [h, w, 1], and the colors of the image [h, w, 3].
+        scored: columns.
+        fitted: columns.
+        covered: bool [h, w], pixels that may be fitted.
+    """
+    color, alpha, image = images
     used = _thinned(covered[:, fitted])
-    squares = np.empty_like(image[:, scored])
-    alpha = render.alpha[:, scored].astype(np.float64)
+    drawn, seen = color[:, fitted][used], image[:, fitted][used]
+    gains, offsets = np.empty(3), np.empty(3)
     for channel in range(3):
-        found = fit_exposure(
-            render.color[:, fitted, channel][used].astype(np.float64), image[:, fitted, channel][used]
-        )
+        found = fit_exposure(drawn[:, channel].copy(), seen[:, channel].copy())
         if isinstance(found, Absent):
             return found
-        gain, offset = found
-        shown = np.clip(gain * render.color[:, scored, channel].astype(np.float64) + offset * alpha, 0, 1)
-        squares[..., channel] = (shown - image[:, scored, channel]) ** 2
-    return squares
+        gains[channel], offsets[channel] = found
+    shown = gains * color[:, scored]
+    shown += offsets * alpha[:, scored]
+    np.clip(shown, 0, 1, out=shown)
+    shown -= image[:, scored]
+    shown *= shown
+    return np.asarray(shown)
 
 
 def _thinned(used: NDArray[np.bool_]) -> NDArray[np.bool_]:

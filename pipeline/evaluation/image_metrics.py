@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,30 +55,127 @@ def counted_windows(mask: masks.Mask) -> masks.Mask:
     return masks.whole_windows(mask, _WINDOW_RADIUS)[inside, inside]
 
 
-def _ssim_terms(
-    x: NDArray[np.float64], y: NDArray[np.float64], mask: masks.Mask | None
-) -> tuple[float, float]:
-    """Mean SSIM and mean contrast-structure term of two images [H, W, C] in 0..1."""
-    if min(x.shape[:2]) < 2 * _WINDOW_RADIUS + 1:
-        raise ValueError(f"an image of {x.shape[1]}x{x.shape[0]} is smaller than the 11x11 window of SSIM")
-    mx, my = _window_mean(x), _window_mean(y)
-    vx, vy = _window_mean(x * x) - mx * mx, _window_mean(y * y) - my * my
-    cov = _window_mean(x * y) - mx * my
-    structure = (2 * cov + _C2) / (vx + vy + _C2)
-    luminance = (2 * mx * my + _C1) / (mx * mx + my * my + _C1)
-    if mask is not None:
-        counted = counted_windows(mask)
-        if not counted.any():
-            raise ValueError("no 11x11 window of SSIM has usable pixels only")
-        luminance, structure = luminance[counted], structure[counted]
-    return float(np.mean(luminance * structure)), float(np.mean(structure))
+_STRIP_ROWS = 32  # of windows at a time: what is computed of them stays in the cache
 
 
-def _clipped(rendered: NDArray, reference: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    x, y = np.clip(np.asarray(rendered, np.float64), 0.0, 1.0), np.asarray(reference, np.float64)
-    if x.shape != y.shape:
-        raise ValueError(f"images of different shapes: {x.shape} and {y.shape}")
-    return x, y
+@dataclass(frozen=True)
+class _Scale:
+    """One scale of an image that renders are compared with: colors y, means and variances of its windows.
+
+    `counted`: window positions that count; None: all.
+    """
+
+    y: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    mask: masks.Mask | None
+    counted: masks.Mask | None
+
+    @staticmethod
+    def of(y: NDArray[np.float64], mask: masks.Mask | None) -> _Scale:
+        if min(y.shape[:2]) < 2 * _WINDOW_RADIUS + 1:
+            raise ValueError(
+                f"an image of {y.shape[1]}x{y.shape[0]} is smaller than the 11x11 window of SSIM"
+            )
+        mean = _window_mean(y)
+        variance = _window_mean(y * y) - mean * mean
+        return _Scale(y, mean, variance, mask, None if mask is None else counted_windows(mask))
+
+    def halved(self) -> _Scale:
+        """The next scale."""
+        return _Scale.of(halve(self.y), None if self.mask is None else masks.halved(self.mask))
+
+    def terms(self, x: NDArray[np.float64]) -> tuple[float, float]:
+        """Mean SSIM and mean contrast-structure term of a render [H, W, C] in 0..1."""
+        whole, structure = np.empty_like(self.mean), np.empty_like(self.mean)
+        for top in range(0, len(self.mean), _STRIP_ROWS):
+            rows = slice(top, top + _STRIP_ROWS)
+            seen = slice(top, top + _STRIP_ROWS + 2 * _WINDOW_RADIUS)
+            whole[rows], structure[rows] = self._strip(x[seen], self.y[seen], rows)
+        if self.counted is not None:
+            if not self.counted.any():
+                raise ValueError("no 11x11 window of SSIM has usable pixels only")
+            if not self.counted.all():
+                whole, structure = whole[self.counted], structure[self.counted]
+        return float(np.mean(whole)), float(np.mean(structure))
+
+    def _strip(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], rows: slice
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """SSIM and contrast-structure term of some rows of windows, from the pixels that they see."""
+        mx, my = _window_mean(x), self.mean[rows]
+        vx = _window_mean(x * x) - mx * mx
+        cov = _window_mean(x * y) - mx * my
+        structure = (2 * cov + _C2) / (vx + self.variance[rows] + _C2)
+        luminance = (2 * mx * my + _C1) / (mx * mx + my * my + _C1)
+        return luminance * structure, structure
+
+
+class SsimReference:
+    """An image that renders are compared with by SSIM and MS-SSIM; what depends on it alone is computed once."""
+
+    def __init__(self, reference: NDArray, mask: masks.Mask | None = None) -> None:
+        """Set up.
+
+        Args:
+            reference: colors [H, W, 3] in 0..1.
+            mask: bool [H, W], pixels that count: window positions that touch another one are left out; None: all.
+        """
+        self._y, self._mask = np.asarray(reference, np.float64), mask
+        self._scales: list[_Scale] = []
+
+    def has_windows(self, scales: int) -> bool:
+        """Whether each of so many scales has a window position that counts.
+
+        Args:
+            scales: the first ones.
+        """
+        if self._mask is None:
+            return True
+        counted = (self._scale(k).counted for k in range(scales))
+        return all(bool(one is not None and one.any()) for one in counted)
+
+    def ssim(self, rendered: NDArray) -> float:
+        """As the function `ssim`.
+
+        Args:
+            rendered: colors [H, W, 3], clipped to 0..1 first.
+        """
+        return self._scale(0).terms(self._clipped(rendered))[0]
+
+    def both(self, rendered: NDArray, weights: Sequence[float] = MS_SSIM_WEIGHTS) -> tuple[float, float]:
+        """SSIM and MS-SSIM of a render, as the functions of these names.
+
+        Args:
+            rendered: colors [H, W, 3], clipped to 0..1 first.
+            weights: of the scales, fine to coarse.
+        """
+        x = self._clipped(rendered)
+        smallest = (2 * _WINDOW_RADIUS + 1) << (len(weights) - 1)
+        if min(x.shape[:2]) < smallest:
+            raise ValueError(
+                f"MS-SSIM of {len(weights)} scales needs {smallest} pixels, found {x.shape[1]}x{x.shape[0]}"
+            )
+        first, product = 0.0, 1.0
+        for k, weight in enumerate(weights):
+            whole, structure = self._scale(k).terms(x)
+            first = first if k else whole
+            product *= max(whole if k == len(weights) - 1 else structure, 0.0) ** weight
+            x = halve(x) if k < len(weights) - 1 else x
+        return first, product
+
+    def _clipped(self, rendered: NDArray) -> NDArray[np.float64]:
+        x = np.clip(np.asarray(rendered, np.float64), 0.0, 1.0)
+        if x.shape != self._y.shape:
+            raise ValueError(f"images of different shapes: {x.shape} and {self._y.shape}")
+        return x
+
+    def _scale(self, k: int) -> _Scale:
+        if not self._scales:
+            self._scales.append(_Scale.of(self._y, self._mask))
+        while len(self._scales) <= k:
+            self._scales.append(self._scales[-1].halved())
+        return self._scales[k]
 
 
 def ssim(rendered: NDArray, reference: NDArray, mask: masks.Mask | None = None) -> float:
@@ -93,7 +191,7 @@ def ssim(rendered: NDArray, reference: NDArray, mask: masks.Mask | None = None) 
         ValueError: images of different shapes, smaller than the window, or none of its positions counts.
     Source: Wang, Bovik, Sheikh, Simoncelli, IEEE TIP 2004.
     """
-    return _ssim_terms(*_clipped(rendered, reference), mask)[0]
+    return SsimReference(reference, mask).ssim(rendered)
 
 
 def ms_ssim(
@@ -117,20 +215,7 @@ def ms_ssim(
         ValueError: images of different shapes, too small for the scales, or no window position counts at one.
     Source: Wang, Simoncelli, Bovik, Asilomar 2003.
     """
-    x, y = _clipped(rendered, reference)
-    smallest = (2 * _WINDOW_RADIUS + 1) << (len(weights) - 1)
-    if min(x.shape[:2]) < smallest:
-        raise ValueError(
-            f"MS-SSIM of {len(weights)} scales needs {smallest} pixels, found {x.shape[1]}x{x.shape[0]}"
-        )
-    product = 1.0
-    for scale, weight in enumerate(weights):
-        whole, structure = _ssim_terms(x, y, mask)
-        last = scale == len(weights) - 1
-        product *= max(whole if last else structure, 0.0) ** weight
-        x, y = halve(x), halve(y)
-        mask = None if mask is None else masks.halved(mask)
-    return product
+    return SsimReference(reference, mask).both(rendered, weights)[1]
 
 
 def depth_error(render: Rendered, depth_m: Image, min_alpha: float = 0.5) -> tuple[float, float]:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.evaluation import image_metrics
 from duagc.pipeline.evaluation.exposure import fitted_psnr
+from duagc.pipeline.evaluation.image_metrics import SsimReference
 from duagc.pipeline.evaluation.results import Absent, mean
-from duagc.pipeline.geometry import masks, se3
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -72,6 +73,7 @@ def score_view(
     common: NDArray[np.bool_] | None = None,
     mask: Mask | None = None,
     exposure: Exposure | None = None,
+    structure: SsimReference | None = None,
 ) -> ViewScore:
     """Compare a render with the image of the same pose, on the pixels that may be used.
 
@@ -85,13 +87,14 @@ def score_view(
         mask: bool [h, w], pixels that may be used: the others count in no score, and windows of SSIM that touch one
             are left out; None: all.
         exposure: of the view, by frames other than it, for `psnr_interpolated_db` alone. None: as the map.
+        structure: of the image in 0..1 and the mask, where several renders are compared with it; None: made here.
     """
     if mask is not None:
         depth_m = np.where(mask, depth_m, np.float32(0))
         exact_m = exact_m if isinstance(exact_m, Absent) else np.where(mask, exact_m, np.float32(0))
     image = color.astype(np.float64) / 255.0
     l1_m, completeness = _depth(render, depth_m, "recorded")
-    side = min(image.shape[:2])
+    ssim, ms_ssim = _structure(render, structure or SsimReference(image, mask), min(image.shape[:2]))
     psnr_db = _psnr(render, image, mask)
     fitted = _psnr_in_fitted_exposure(render, image, mask)
     return ViewScore(
@@ -102,12 +105,8 @@ def score_view(
         psnr_exposure_db=fitted[0],
         psnr_exposure_left_db=fitted[1],
         psnr_exposure_right_db=fitted[2],
-        ssim=image_metrics.ssim(render.color, image, mask) if _has_windows(mask, 0) else NO_WINDOW,
-        ms_ssim=Absent(f"the shorter side is {side} px; five scales need {MS_SSIM_MIN_SIDE_PX} px")
-        if side < MS_SSIM_MIN_SIDE_PX
-        else image_metrics.ms_ssim(render.color, image, mask=mask)
-        if _has_windows(mask, len(image_metrics.MS_SSIM_WEIGHTS) - 1)
-        else NO_WINDOW,
+        ssim=ssim,
+        ms_ssim=ms_ssim,
         depth_l1_m=l1_m,
         depth_l1_exact_m=exact_m if isinstance(exact_m, Absent) else _depth(render, exact_m, "exact")[0],
         depth_l1_layer_m=layer_m if isinstance(layer_m, Absent) else _layer(layer_m, depth_m),
@@ -145,13 +144,19 @@ def _psnr_in_fitted_exposure(
     return both, left, right
 
 
-def _has_windows(mask: Mask | None, halvings: int) -> bool:
-    """Whether a window of SSIM touches usable pixels only, after so many halvings of the image."""
-    if mask is None:
-        return True
-    for _ in range(halvings):
-        mask = masks.halved(mask)
-    return bool(image_metrics.counted_windows(mask).any())
+def _structure(render: Render, reference: SsimReference, side_px: int) -> tuple[Score, Score]:
+    """SSIM and MS-SSIM."""
+    if not reference.has_windows(1):
+        return NO_WINDOW, NO_WINDOW if side_px >= MS_SSIM_MIN_SIDE_PX else _too_small(side_px)
+    if side_px < MS_SSIM_MIN_SIDE_PX:
+        return reference.ssim(render.color), _too_small(side_px)
+    if not reference.has_windows(len(image_metrics.MS_SSIM_WEIGHTS)):
+        return reference.ssim(render.color), NO_WINDOW
+    return reference.both(render.color)
+
+
+def _too_small(side_px: int) -> Absent:
+    return Absent(f"the shorter side is {side_px} px; five scales need {MS_SSIM_MIN_SIDE_PX} px")
 
 
 def _layer(layer_m: NDArray[np.float32], depth_m: NDArray[np.float32]) -> Score:
@@ -230,6 +235,7 @@ def score_maps(
             if T is not None:
                 render = own.rasterizer.forward(gaussians, camera, se3.inverse(T), depth_kind=depth)
                 drawn[name] = render, own.rasterizer.layer_depth()
+        structure = SsimReference(frame.color.astype(np.float64) / 255.0, frame.mask)
         together = [drawn[name][0].alpha >= MIN_ALPHA for name in compared if name in drawn]
         common = np.logical_and.reduce(together) if len(together) > 1 else None
         scores: dict[str, ViewScore | Absent] = dict.fromkeys(
@@ -245,6 +251,7 @@ def score_maps(
                 common=common,
                 mask=frame.mask,
                 exposure=view.exposure,
+                structure=structure,
             )
         return frame.index, scores
 
