@@ -117,8 +117,12 @@ class Chain:
 
         def meet(timing: Timing) -> None:
             settings = carrier.settings_of(stages.EXCHANGE)
+            checkpoints = carrier.checkpoints(carrier.key(stages.EXCHANGE, None, inputs))
             with timing.stage(stages.EXCHANGE, carrier.folder):
-                steps.exchange(logs, carrier.folder, settings, watch=self._watch.round)
+                steps.exchange(
+                    logs, carrier.folder, settings, checkpoints=checkpoints, watch=self._watch.round
+                )
+            timing.went_on(stages.EXCHANGE.name, *checkpoints.before_s)
 
         inputs: dict[str, str] = {}
         for name, robot in sorted(prepared.items()):
@@ -164,15 +168,19 @@ class Chain:
             workers: how many robots it looks at at the same time, asked if it is computed; changes no bit.
         """
         carrier, recording = self._carrier, self._recording.path
-        step = getattr(steps, "view" if stage is stages.VIEW else stage.name)
+        inputs = {name: d.content for c in done for name, d in c.entry.files.items()}
+        inputs |= {f"recording: {name}": digest for name, digest in self._recorded().items()} | dict(more)
 
         def read(timing: Timing) -> None:
             with timing.stage(stage, carrier.folder):
-                step(carrier.folder, recording, workers())
+                if stage is stages.EVALUATION:
+                    saved = carrier.checkpoints(carrier.key(stage, None, inputs)).folder
+                    steps.evaluation(carrier.folder, recording, workers(), saved)
+                else:
+                    step = steps.report if stage is stages.REPORT else steps.view
+                    step(carrier.folder, recording, workers())
 
-        inputs = {name: d.content for c in done for name, d in c.entry.files.items()}
-        inputs |= {f"recording: {name}": digest for name, digest in self._recorded().items()}
-        return carrier.carry(stage, None, {**inputs, **more}, read)
+        return carrier.carry(stage, None, inputs, read)
 
     def _recorded(self) -> dict[str, str]:
         """Digests of all that the recording names, true poses and geometry among it."""

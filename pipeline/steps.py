@@ -156,7 +156,12 @@ def agent_input(robot: str, log: Path, folder: Path, config: RunConfig) -> Agent
 
 
 def exchange(
-    logs: dict[str, Path], folder: Path, config: RunConfig, *, watch: RoundWatch | None = None
+    logs: dict[str, Path],
+    folder: Path,
+    config: RunConfig,
+    *,
+    checkpoints: Checkpoints,
+    watch: RoundWatch | None = None,
 ) -> None:
     """Let the team meet.
 
@@ -164,6 +169,7 @@ def exchange(
         logs: of the robots' sensors, by name of the component.
         folder: of the run; gets exchange.mcap, consensus.mcap, and what each robot takes home.
         config: of the run.
+        checkpoints: from which it goes on, and to which it saves; they change no bit of the result.
         watch: hears of every round, and changes nothing.
     """
     from duagc.pipeline.exchange.session import run_session
@@ -178,6 +184,7 @@ def exchange(
         exchange_path=folder / "exchange.mcap",
         consensus_path=folder / "consensus.mcap",
         watch=watch,
+        checkpoints=checkpoints,
     )
     for robot, result in results.items():
         write_session_result(folder / "robots" / robot / NAME, result)
@@ -237,18 +244,19 @@ def fuse_robot(
     return {check.peer: check.reason for check in checks if not check.trusted}
 
 
-def evaluation(folder: Path, recording: Path, workers: int = 1) -> None:
+def evaluation(folder: Path, recording: Path, workers: int = 1, saved: Path | None = None) -> None:
     """Measure the run.
 
     Args:
         folder: of the run; gets metrics.json and metrics.parquet.
         recording: folder of its recording.
         workers: robots measured at the same time; changes no bit of the result.
+        saved: folder of what is done, from which it goes on; None: nothing is saved.
     """
     from duagc.pipeline.evaluation import evaluate
 
     determinism.configure_opencv()
-    evaluate(folder, recording, threads=threads_per_worker(workers), workers=workers)
+    evaluate(folder, recording, threads=threads_per_worker(workers), workers=workers, saved=saved)
 
 
 def report(folder: Path, recording: Path, workers: int = 1) -> None:

@@ -106,6 +106,11 @@ class Checkpoints:
         self._names = {id(value): name for name, value in self._known.items()}
 
     @property
+    def folder(self) -> Path | None:
+        """Of this computation; None: nothing is saved."""
+        return self._folder
+
+    @property
     def before_s(self) -> tuple[float, float]:
         """Wall and processor time of the processes whose work goes on here."""
         return self._before
@@ -120,7 +125,8 @@ class Checkpoints:
         if found is None:
             return None
         state, done, total = found
-        self._say(f"{name}: goes on at {done}/{total}")
+        where = f"at {done}/{total}" if done < total else f"with {done} results"
+        self._say(f"{name}: goes on {where}")
         return done, state
 
     def tell(self, name: str, done: int, total: int, shown: Shown | None = None) -> None:

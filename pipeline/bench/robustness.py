@@ -24,7 +24,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.evaluation import coverage, trajectory_errors
 from duagc.pipeline.evaluation.results import Absent, write_json
-from duagc.pipeline.evaluation.stage import TruePaths
+from duagc.pipeline.evaluation.true_paths import TruePaths
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RunFolder
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
@@ -110,6 +111,7 @@ def robot_scores(
     progress: bool,
     longer: Gaussians | None,
     most_views: int = MOST_VIEWS,
+    save: Checkpoints = NO_CHECKPOINTS,
 ) -> list[Scored]:
     """Scores of the maps of one robot at its views, and at those of its peers.
 
@@ -121,6 +123,7 @@ def robot_scores(
         progress: show it on standard error.
         longer: its own map, trained longer, in its map frame; None: there is none.
         most_views: of a set, evenly spread; of peers' views all peers have the same share.
+        save: of every set of views, when it is done.
     """
     found: list[Scored] = []
     robot = run.robots[name]
@@ -130,8 +133,11 @@ def robot_scores(
     own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
 
     def score(task: RenderTask, view_set: str, title: str) -> None:
-        for index, scores in task.scores(source, threads, title if progress else None):
-            found.extend((kind, view_set, index, score) for kind, score in scores.items())
+        def scored() -> list[Scored]:
+            views_of_set = task.scores(source, threads, title if progress else None)
+            return [(kind, view_set, i, score) for i, of in views_of_set for kind, score in of.items()]
+
+        found.extend(save.done(f"{view_set} of {task.camera_robot.robot}", scored))
 
     task = RenderTask(own, robot, "held_out", robot.own_map.depth, most_views)
     score(task, "held_out", f"render maps of {name}")

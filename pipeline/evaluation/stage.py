@@ -4,33 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from duagc.pipeline.base import determinism
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.evaluation import (
     cameras,
     coverage,
     groundtruth,
-    map_agreement,
     map_errors,
     trajectory_errors,
-    uncertainty_calibration,
 )
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.rendering import (
     MOST_VIEWS,
-    Scored,
-    poses_by_stamp,
     rendering_sections,
-    robot_scores,
 )
 from duagc.pipeline.evaluation.results import (
     Absent,
@@ -42,11 +33,11 @@ from duagc.pipeline.evaluation.results import (
     write_json,
     write_parquet,
 )
+from duagc.pipeline.evaluation.robot_measures import RobotMeasures, RobotTask, measured
 from duagc.pipeline.evaluation.trajectory_errors import Paired, TeamError
-from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.evaluation.true_paths import TruePaths
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import METRICS_SCHEMA, RobotRun, RunFolder
-from duagc.pipeline.runs.stages import EVALUATION
 from duagc.pipeline.splat.gaussians import Gaussians
 
 PROTOCOL = {
@@ -92,6 +83,7 @@ def evaluate(
     progress: bool = True,
     own_longer: Mapping[str, Gaussians] | None = None,
     most_views: int = MOST_VIEWS,
+    saved: Path | None = None,
 ) -> dict[str, Any]:
     """Measure a run against its recording and write metrics.json and metrics.parquet into its folder.
 
@@ -104,6 +96,8 @@ def evaluate(
         own_longer: own maps trained as long as the final ones, by robot, to be scored too
             (`experiments.own_longer`).
         most_views: of a set that maps are scored at, evenly spread.
+        saved: folder of the parts that are done, from which a process goes on that follows one that was killed;
+            None: nothing is saved.
 
     Returns:
         The content of metrics.json.
@@ -117,14 +111,14 @@ def evaluate(
         raise DuagError(f"{recording}: has no robot {unknown[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
     longer, rows = own_longer or {}, list[Row]()
-    task = _Task(Path(run_dir), Path(recording), threads, progress, most_views)
-    measured = _measured(task, run, source, truth, workers=workers, own_longer=longer)
-    rendering = rendering_sections({name: m.scores for name, m in measured.items()}, longer=bool(longer))
+    task = RobotTask(Path(run_dir), Path(recording), threads, progress, most_views, saved)
+    of_robots = measured(task, run, source, truth, workers=workers, own_longer=longer)
+    rendering = rendering_sections({name: m.scores for name, m in of_robots.items()}, longer=bool(longer))
     tree = {
         "schema": METRICS_SCHEMA,
         "robots": {
             name: _robot_section(robot, truth)
-            | measured[name].agreement
+            | of_robots[name].agreement
             | {"camera": cameras.section(robot), "rendering": rendering.robots[name]}
             for name, robot in run.robots.items()
         },
@@ -132,7 +126,7 @@ def evaluate(
         "coverage": coverage.of_robots(run),
         "components": coverage.of_components(run, truth.after),
         "rendering": rendering.team,
-        "calibration": _calibration_section(source, measured, rows),
+        "calibration": _calibration_section(source, of_robots, rows),
         "exchange": session.exchange_section(),
         "consensus": session.consensus_section(),
         "protocol": PROTOCOL | {"views": f"at most {most_views} of a set, evenly spread"},
@@ -144,118 +138,7 @@ def evaluate(
     return metrics
 
 
-# --- one robot ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class RobotMeasures:
-    """What is measured of one robot by itself, and takes its time.
-
-    Attributes:
-        scores: of its maps, by view.
-        agreement: of its images with each other at its poses.
-        calibration: scores of its fused map next to the true surface; a reason where there is none.
-        reliability: of these, rows of the long table.
-    """
-
-    scores: list[Scored]
-    agreement: dict[str, Any]
-    calibration: dict[str, Any]
-    reliability: list[Row]
-
-
-@dataclass(frozen=True)
-class _Task:
-    """Measures robots of a run; also in a process of its own."""
-
-    run_dir: Path
-    recording: Path
-    threads: int
-    progress: bool
-    most_views: int
-
-    def in_worker(self, name: str, longer: Gaussians | None) -> RobotMeasures:
-        """In a process that knows nothing of the run yet."""
-        determinism.configure_opencv()
-        with EVALUATION.running(self.run_dir):
-            run, source = RunFolder(self.run_dir), Recording(self.recording)
-            return self.of(name, run, source, truth=TruePaths.of(run, source), longer=longer)
-
-    def of(
-        self, name: str, run: RunFolder, source: Recording, *, truth: TruePaths, longer: Gaussians | None
-    ) -> RobotMeasures:
-        """In this process."""
-        robot = run.robots[name]
-        scores = robot_scores(
-            run,
-            source,
-            name,
-            threads=self.threads,
-            progress=self.progress,
-            longer=longer,
-            most_views=self.most_views,
-        )
-        calibration, rows = _calibration_of(robot, source, truth)
-        return RobotMeasures(scores, _agreement_section(robot, source, truth), calibration, rows)
-
-
-def _measured(
-    task: _Task,
-    run: RunFolder,
-    source: Recording,
-    truth: TruePaths,
-    *,
-    workers: int,
-    own_longer: Mapping[str, Gaussians],
-) -> dict[str, RobotMeasures]:
-    """Every robot, by name."""
-    if min(workers, len(run.robots)) == 1:
-        return {
-            name: task.of(name, run, source, truth=truth, longer=own_longer.get(name)) for name in run.robots
-        }
-    with worker_pool(min(workers, len(run.robots))) as pool:
-        begun = {name: pool.submit(task.in_worker, name, own_longer.get(name)) for name in run.robots}
-        return {name: result.result() for name, result in begun.items()}
-
-
 # --- trajectories ------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class TruePaths:
-    """Estimates paired with ground truth, by robot: after and before consensus; and the joint alignment of the team."""
-
-    after: Mapping[str, Paired | Absent]
-    before: Mapping[str, Paired | Absent]
-    team: TeamError | Absent
-
-    @staticmethod
-    def of(run: RunFolder, source: Recording) -> TruePaths:
-        after, before = {}, {}
-        for name, robot in run.robots.items():
-            true = groundtruth.trajectory(source, name)
-            rotations = groundtruth.knows_rotations(source, name)
-            after[name] = _paired(true, robot.trajectory, rotations)
-            before[name] = _paired(true, robot.odometry, rotations)
-        known = {r: p for r in run.largest_component if not isinstance(p := after[r], Absent)}
-        missing = [p for r in run.largest_component if isinstance(p := after[r], Absent)]
-        alone = len(run.largest_component) < 2
-        team = missing[0] if missing and not alone else trajectory_errors.team_error(known)
-        return TruePaths(after, before, team)
-
-    def T_gt_world(self, robot: str) -> NDArray[np.float64] | Absent:  # noqa: N802 (a transform)
-        """[4, 4]: the joint alignment for robots of the largest component, its own for any other robot."""
-        if not isinstance(self.team, Absent) and robot in self.team.ate_rmse_m_of:
-            return self.team.T_gt_world
-        pairs = self.after[robot]
-        return pairs if isinstance(pairs, Absent) else trajectory_errors.alignment([pairs])
-
-
-def _paired(true: Trajectory | Absent, estimated: Trajectory, rotations: bool) -> Paired | Absent:
-    if isinstance(true, Absent):
-        return true
-    pairs = replace(trajectory_errors.pair(true, estimated), positions_only=not rotations)
-    return pairs if len(pairs) else Absent("no frame has a ground-truth pose within 20 ms")
 
 
 def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
@@ -285,13 +168,6 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
         "rpe_rot_rad": rpe_rot_rad,
         "frames_with_truth": len(after),
     }
-
-
-def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
-    held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
-    paths = {"": poses_by_stamp(robot.trajectory), "_before_consensus": poses_by_stamp(robot.odometry)}
-    true, frontend = truth.after[robot.robot], robot.folder / "frontend.mcap"
-    return map_agreement.section(source.log(robot.robot), held_out, paths, true, frontend=frontend)
 
 
 def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:
@@ -325,27 +201,15 @@ def _team_section(run: RunFolder, truth: TruePaths) -> dict[str, Any]:
 # --- calibration -------------------------------------------------------------------------------------------------
 
 
-def _calibration_of(robot: RobotRun, source: Recording, truth: TruePaths) -> tuple[dict[str, Any], list[Row]]:
-    """The calibration of a fused map, and how errors and sigmas go together."""
-    surface = groundtruth.surface(source)
-    if isinstance(surface, Absent):
-        return dict.fromkeys(map_errors.NAMES, surface), []
-    T_gt_world = truth.T_gt_world(robot.robot)
-    if isinstance(T_gt_world, Absent):
-        return dict.fromkeys(map_errors.NAMES, T_gt_world), []
-    errors = map_errors.map_errors(robot.fused_map, surface, T_gt_world)
-    return map_errors.scores(errors, robot.robot), _reliability_rows(robot.robot, errors)
-
-
 def _calibration_section(
-    source: Recording, measured: Mapping[str, RobotMeasures], rows: list[Row]
+    source: Recording, robots: Mapping[str, RobotMeasures], rows: list[Row]
 ) -> dict[str, Any]:
     """Mean over robots of the calibration of their fused maps; the values of each robot go into rows."""
     surface = groundtruth.surface(source)
     if isinstance(surface, Absent):
         return dict.fromkeys(map_errors.NAMES, surface)
-    of_robots = {name: robot.calibration for name, robot in measured.items()}
-    for robot in measured.values():
+    of_robots = {name: robot.calibration for name, robot in robots.items()}
+    for robot in robots.values():
         rows += robot.reliability
     for name, values in of_robots.items():
         rows += [Row("calibration", name, "", -1, key, value) for key, value in values.items()]
@@ -360,18 +224,6 @@ def _mean_or_sum(name: str, values: list[float | Absent]) -> float | Absent:
         counts = [v for v in values if not isinstance(v, Absent)]
         return int(math.fsum(counts)) if counts else values[0]
     return mean(values)
-
-
-def _reliability_rows(robot: str, errors: map_errors.MapErrors) -> list[Row]:
-    if len(errors.error_m) < map_errors.MIN_GAUSSIANS:
-        return []
-    rows = []
-    for decile, (predicted_m, observed_m) in enumerate(
-        uncertainty_calibration.reliability(errors.sigma_m, errors.error_m)
-    ):
-        rows.append(Row("reliability", robot, f"decile {decile}", -1, "predicted_rms_m", predicted_m))
-        rows.append(Row("reliability", robot, f"decile {decile}", -1, "observed_rms_m", observed_m))
-    return rows
 
 
 # --- the long table ----------------------------------------------------------------------------------------------

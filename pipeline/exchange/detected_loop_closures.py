@@ -17,13 +17,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.recall import Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.exchange import injection, place_recognition
@@ -56,8 +57,8 @@ NOTHING_SHARED = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.floa
 class KeyframeDatabase:
     """A robot's own keyframes as others may request them; computed when first needed."""
 
-    def __init__(self, data: RobotData, config: ExchangeConfig) -> None:
-        self.data, self.config = data, config
+    def __init__(self, data: RobotData, config: ExchangeConfig, recall: Recalling = computed) -> None:
+        self.data, self.config, self.recall = data, config, recall
         self._pyramid = lru_cache(maxsize=PYRAMIDS_KEPT)(self._build_pyramid)
         self._features: list[Features] | None = None
         self._coarse_depths: list[NDArray[np.float32]] = []
@@ -75,11 +76,16 @@ class KeyframeDatabase:
         if self._features is None:
             self._features = []
             for k in range(self.data.keyframes):
-                color, depth_m, _, mask = self.data.images(k)
-                most = self.config.places.features_per_keyframe
-                self._features.append(extract(color, depth_m, self.data.camera, most, mask=mask))
-                self._coarse_depths.append(coarse_depth(depth_m))
+                features, depth_m = self.recall(f"features {self.data.robot} {k}", partial(self._seen, k))
+                self._features.append(features)
+                self._coarse_depths.append(depth_m)
         return self._features
+
+    def _seen(self, keyframe: int) -> tuple[Features, NDArray[np.float32]]:
+        """Features of a keyframe, and its depth at low resolution."""
+        color, depth_m, _, mask = self.data.images(keyframe)
+        most = self.config.places.features_per_keyframe
+        return extract(color, depth_m, self.data.camera, most, mask=mask), coarse_depth(depth_m)
 
     def agreement(self, samples: Sequence[NDArray[np.floating]], T_first_peer: Array) -> float:
         """How well own depth images agree with a neighbor's samples [m, 3], keyframes at T_first_peer [k, 4, 4]."""
@@ -127,16 +133,19 @@ class DetectedLoopClosures:
     trusted = False
     revokes = True
 
-    def __init__(self, data: RobotData, config: ExchangeConfig, seed: int) -> None:
+    def __init__(
+        self, data: RobotData, config: ExchangeConfig, seed: int, recall: Recalling = computed
+    ) -> None:
         """Start from a robot's own images.
 
         Args:
             data: of this robot.
             config: the same at all robots.
             seed: of this run.
+            recall: slow results; they change no bit.
         """
         self.config, self.seed = config, seed
-        self.database = KeyframeDatabase(data, config)
+        self.database = KeyframeDatabase(data, config, recall)
 
     @property
     def greeting(self) -> bytes:
@@ -246,16 +255,23 @@ class Verifier(LoopClosureProtocol):
             ends = (self.database.features[candidate.own_keyframe], sample.features)
             own, peer = (hashlib.sha256(f.descriptors.tobytes()).hexdigest() for f in ends)
             rng = random_streams.generator(self.seed, "ransac", own=own, peer=peer)
-            result = verify(
-                candidate,
-                self.database.features[candidate.own_keyframe],
-                self.database.pyramid(candidate.own_keyframe),
-                sample,
-                config=self.config.verification,
-                rng=rng,
+            result = self.database.recall(
+                f"{self.own} verifies {candidate.own_keyframe}, {self.peer} {candidate.peer_keyframe}",
+                partial(self._verified, candidate, sample, rng),
             )
             self.tried.append(Tried(candidate, result))
             self.planner.take(candidate, result.closure is not None)
+
+    def _verified(self, candidate: Candidate, sample: KeyframeSample, rng: np.random.Generator) -> Verified:
+        own = candidate.own_keyframe
+        return verify(
+            candidate,
+            self.database.features[own],
+            self.database.pyramid(own),
+            sample,
+            config=self.config.verification,
+            rng=rng,
+        )
 
     def _inject(self) -> None:
         """Add the false loop closures that the configuration wants."""

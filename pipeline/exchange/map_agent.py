@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from duagc.pipeline.base.recall import Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange.agent import Agent
 from duagc.pipeline.exchange.detected_loop_closures import DetectedLoopClosures
@@ -28,6 +29,7 @@ class MapAgent(Agent):
         config: ExchangeConfig,
         *,
         seed: int,
+        recall: Recalling = computed,
     ) -> None:
         """Start with own data only.
 
@@ -37,9 +39,10 @@ class MapAgent(Agent):
             neighbors: names of those that this robot has a radio link to.
             config: the same at all robots.
             seed: of this run.
+            recall: slow results; they change no bit.
         """
-        source = DetectedLoopClosures(data, config, seed)
-        self.data, self.evidence = data, Sharing(data, team, config, seed)
+        source = DetectedLoopClosures(data, config, seed, recall)
+        self.data, self.evidence = data, Sharing(data, team, config, seed, recall=recall)
         super().__init__(
             source.database.graph,
             team,

@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.recall import Recall, Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder, RawAlternative
@@ -31,6 +33,7 @@ def run_session(
     exchange_path: Path,
     consensus_path: Path,
     watch: RoundWatch | None = None,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> dict[str, SessionResult]:
     """Let the team meet.
 
@@ -41,6 +44,7 @@ def run_session(
         exchange_path: log of messages and packets to write.
         consensus_path: log of rounds and loop closures to write.
         watch: hears of every round, and changes nothing.
+        checkpoints: keep what is slow; a session that was killed begins again, and takes it from there.
     Returns:
         The result of every robot, by name.
     Raises:
@@ -54,6 +58,7 @@ def run_session(
         exchange_path=exchange_path,
         consensus_path=consensus_path,
         watch=watch,
+        checkpoints=checkpoints,
     )
 
 
@@ -95,10 +100,11 @@ def run_session_of(
     exchange_path: Path,
     consensus_path: Path,
     watch: RoundWatch | None = None,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> dict[str, SessionResult]:
     """`run_session` on data in memory, one entry per robot."""
     determinism.configure_opencv()
-    agents = team_of(data, config, seed)
+    agents = team_of(data, config, seed, Recall(checkpoints, "session"))
     metadata = {"config": config.model_dump_json(), "seed": str(seed)}
     with (
         LogWriter(exchange_path, metadata=metadata) as exchange,
@@ -127,11 +133,15 @@ def run_session_of(
     return results
 
 
-def team_of(data: Sequence[RobotData], config: ExchangeConfig, seed: int) -> dict[str, MapAgent]:
+def team_of(
+    data: Sequence[RobotData], config: ExchangeConfig, seed: int, recall: Recalling = computed
+) -> dict[str, MapAgent]:
     """The agents of a team, by name, in alphabetical order; each is given its own data only."""
     names = sorted(d.robot for d in data)
     if len(set(names)) != len(names) or len(names) > MAX_TEAM:
         raise DuagError(f"team of {len(names)}: expected different names and at most {MAX_TEAM} robots")
     linked = link_model.neighbors(config.link, names)
     by_name = {d.robot: d for d in data}
-    return {name: MapAgent(by_name[name], names, linked[name], config, seed=seed) for name in names}
+    return {
+        name: MapAgent(by_name[name], names, linked[name], config, seed=seed, recall=recall) for name in names
+    }

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.recall import Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
 from duagc.pipeline.exchange.evidence_records import best_first, match_pairs, own_records, seen_voxels, within
@@ -113,7 +117,15 @@ class Sharing:
 
     enabled = True
 
-    def __init__(self, data: RobotData, team: Sequence[str], config: ExchangeConfig, seed: int) -> None:
+    def __init__(
+        self,
+        data: RobotData,
+        team: Sequence[str],
+        config: ExchangeConfig,
+        seed: int,
+        *,
+        recall: Recalling = computed,
+    ) -> None:
         """Start with own data only.
 
         Args:
@@ -121,8 +133,10 @@ class Sharing:
             team: names of all robots that may exist.
             config: the same at all robots.
             seed: of this run.
+            recall: slow results; they change no bit.
         """
         self.data, self.team, self.config, self.seed = data, sorted(team), config, seed
+        self.recall = recall
         self.own = self.team.index(data.robot)
         self.kind = EVIDENCE_WIRES[config.evidence_wire]
         self.knowledge = Knowledge(self.own, len(self.team), self.kind)
@@ -134,11 +148,13 @@ class Sharing:
     def own_body(self) -> NDArray[Any]:
         """Own evidence as it is sent, best first."""
         if self._body is None:
-            records = own_records(self.data, self.kind, self.config.weights)
-            self._body = evidence_wire.to_body(
-                self.kind, records[best_first(records, self.config.evidence_order)]
-            )
+            self._body = self.recall(f"evidence of {self.data.robot}", self._ordered_body)
         return self._body
+
+    def _ordered_body(self) -> NDArray[Any]:
+        records = own_records(self.data, self.kind, self.config.weights)
+        order = best_first(records, self.config.evidence_order)
+        return evidence_wire.to_body(self.kind, records[order])
 
     def own_records(self) -> NDArray[Any]:
         """Own evidence as the others read it, best first."""
@@ -283,14 +299,22 @@ class Sharing:
         for other in others:
             ready = other in k.anchors and other in k.evidence and (self.own, other) not in k.pairs
             if self.own < other and ready:
-                ids = match_pairs(
-                    (self.data.robot, self.own_records(), k.anchors[self.own].T_common_keyframe),
-                    (self.team[other], k.sound_records(other), k.anchors[other].T_common_keyframe),
-                    self.config.matching.of_maps(self.data.thickness_floor_m),
-                )
+                mine = self.data.robot, self.own_records(), k.anchors[self.own].T_common_keyframe
+                theirs = self.team[other], k.sound_records(other), k.anchors[other].T_common_keyframe
+                matching = self.config.matching.of_maps(self.data.thickness_floor_m)
+                name = f"matches {mine[0]} {theirs[0]} {_digest(*mine[1:], *theirs[1:])}"
+                ids = self.recall(name, partial(match_pairs, mine, theirs, matching))
                 ids = injection.false_matches(
                     ids, self.config.injection, seed=self.seed, robot=self.data.robot, peer=self.team[other]
                 )
                 pairs = PairList(self.own, other, 1, ids)
                 k.pairs[self.own, other] = pairs
                 k.pairs_bytes[self.own, other] = state_wire.write_pairs(pairs)
+
+
+def _digest(*arrays: NDArray[Any]) -> str:
+    """Of what matches follow from: evidence changes while it arrives, and poses with the links of the team."""
+    whole = hashlib.sha256()
+    for array in arrays:
+        whole.update(np.ascontiguousarray(array).data)
+    return whole.hexdigest()

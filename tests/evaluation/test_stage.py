@@ -9,9 +9,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from duagc.pipeline.base import checkpoints
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli.runs import evaluate as evaluate_command
-from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.evaluation import evaluate, robot_measures
+from duagc.pipeline.evaluation import views as scored_views
 from duagc.pipeline.evaluation.rendering import MOST_VIEWS
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.experiments.own_longer import own_longer
@@ -186,6 +188,28 @@ def test_maps_are_rendered_from_held_out_and_training_views(metrics):
         )  # rounding to 1 mm: 0.25 mm
         assert fused[view_set]["depth_completeness"] == 1.0
         assert own[view_set]["psnr_db"] < fused[view_set]["psnr_db"] - 5  # seen from poses that drift
+
+
+def test_an_evaluation_that_was_killed_goes_on_with_what_is_done(metrics, tmp_path, monkeypatch):
+    fake, saved = make(tmp_path), tmp_path / "saved"
+    monkeypatch.setattr(checkpoints, "WORTH_S", 0.0)
+
+    def killed(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(robot_measures.map_agreement, "section", killed)  # the last part of the first robot
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(fake.run, fake.recording, progress=False, saved=saved)
+    done = sorted(path.relative_to(saved).as_posix() for path in saved.rglob("*.done"))
+    assert [name.split()[0] for name in done] == [
+        "alpha/calibration.done", "alpha/held_out", "alpha/peers", "alpha/training",
+    ]  # fmt: skip
+    drawn = []
+    score_maps = scored_views.score_maps
+    monkeypatch.setattr(scored_views, "score_maps", lambda *a, **k: drawn.append(0) or score_maps(*a, **k))
+    assert evaluate(fake.run, fake.recording, progress=False, saved=saved) == metrics
+    assert len(drawn) == 3  # bravo's
 
 
 def test_few_views_of_a_set_are_scored_if_asked(metrics, tmp_path):

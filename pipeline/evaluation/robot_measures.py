@@ -1,0 +1,156 @@
+"""What is measured of every robot by itself, and takes its time: renders, agreement of images, calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.checkpoints import Checkpoints
+from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.evaluation import groundtruth, map_agreement, map_errors, uncertainty_calibration
+from duagc.pipeline.evaluation.rendering import Scored, poses_by_stamp, robot_scores
+from duagc.pipeline.evaluation.results import Absent, Row
+from duagc.pipeline.evaluation.true_paths import TruePaths
+from duagc.pipeline.recording import Recording
+from duagc.pipeline.runs.folder import RobotRun, RunFolder
+from duagc.pipeline.runs.stages import EVALUATION
+from duagc.pipeline.splat.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class RobotMeasures:
+    """What is measured of one robot by itself, and takes its time.
+
+    Attributes:
+        scores: of its maps, by view.
+        agreement: of its images with each other at its poses.
+        calibration: scores of its fused map next to the true surface; a reason where there is none.
+        reliability: of these, rows of the long table.
+    """
+
+    scores: list[Scored]
+    agreement: dict[str, Any]
+    calibration: dict[str, Any]
+    reliability: list[Row]
+
+
+@dataclass(frozen=True)
+class RobotTask:
+    """Measures robots of a run; also in a process of its own.
+
+    Attributes:
+        run_dir: folder of the run.
+        recording: folder of its recording.
+        threads: views rendered at the same time; changes no bit of the result.
+        progress: show it on standard error.
+        most_views: of a set that maps are scored at, evenly spread.
+        saved: folder of the parts that are done, from which a process goes on that follows one that was killed.
+    """
+
+    run_dir: Path
+    recording: Path
+    threads: int
+    progress: bool
+    most_views: int
+    saved: Path | None = None
+
+    def in_worker(self, name: str, longer: Gaussians | None) -> RobotMeasures:
+        """In a process that knows nothing of the run yet.
+
+        Args:
+            name: of the robot.
+            longer: its own map, trained longer; None: there is none.
+        """
+        determinism.configure_opencv()
+        with EVALUATION.running(self.run_dir):
+            run, source = RunFolder(self.run_dir), Recording(self.recording)
+            return self.of(name, run, source, truth=TruePaths.of(run, source), longer=longer)
+
+    def of(
+        self, name: str, run: RunFolder, source: Recording, *, truth: TruePaths, longer: Gaussians | None
+    ) -> RobotMeasures:
+        """In this process.
+
+        Args:
+            name: of the robot.
+            run: the run.
+            source: its recording.
+            truth: paths next to the true ones.
+            longer: its own map, trained longer; None: there is none.
+        """
+        robot, save = run.robots[name], Checkpoints(None if self.saved is None else self.saved / name)
+        scores = robot_scores(
+            run,
+            source,
+            name,
+            threads=self.threads,
+            progress=self.progress,
+            longer=longer,
+            most_views=self.most_views,
+            save=save,
+        )
+        calibration, rows = save.done("calibration", lambda: _calibration_of(robot, source, truth))
+        agreement = save.done("agreement", lambda: _agreement_section(robot, source, truth))
+        return RobotMeasures(scores, agreement, calibration, rows)
+
+
+def measured(
+    task: RobotTask,
+    run: RunFolder,
+    source: Recording,
+    truth: TruePaths,
+    *,
+    workers: int,
+    own_longer: Mapping[str, Gaussians],
+) -> dict[str, RobotMeasures]:
+    """Every robot, by name.
+
+    Args:
+        task: measures one.
+        run: the run.
+        source: its recording.
+        truth: paths next to the true ones.
+        workers: robots measured at the same time, in processes of their own if more than one.
+        own_longer: own maps trained longer, by robot.
+    """
+    if min(workers, len(run.robots)) == 1:
+        return {
+            name: task.of(name, run, source, truth=truth, longer=own_longer.get(name)) for name in run.robots
+        }
+    with worker_pool(min(workers, len(run.robots))) as pool:
+        begun = {name: pool.submit(task.in_worker, name, own_longer.get(name)) for name in run.robots}
+        return {name: result.result() for name, result in begun.items()}
+
+
+def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
+    held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
+    paths = {"": poses_by_stamp(robot.trajectory), "_before_consensus": poses_by_stamp(robot.odometry)}
+    true, frontend = truth.after[robot.robot], robot.folder / "frontend.mcap"
+    return map_agreement.section(source.log(robot.robot), held_out, paths, true, frontend=frontend)
+
+
+def _calibration_of(robot: RobotRun, source: Recording, truth: TruePaths) -> tuple[dict[str, Any], list[Row]]:
+    """The calibration of a fused map, and how errors and sigmas go together."""
+    surface = groundtruth.surface(source)
+    if isinstance(surface, Absent):
+        return dict.fromkeys(map_errors.NAMES, surface), []
+    T_gt_world = truth.T_gt_world(robot.robot)
+    if isinstance(T_gt_world, Absent):
+        return dict.fromkeys(map_errors.NAMES, T_gt_world), []
+    errors = map_errors.map_errors(robot.fused_map, surface, T_gt_world)
+    return map_errors.scores(errors, robot.robot), _reliability_rows(robot.robot, errors)
+
+
+def _reliability_rows(robot: str, errors: map_errors.MapErrors) -> list[Row]:
+    if len(errors.error_m) < map_errors.MIN_GAUSSIANS:
+        return []
+    rows = []
+    for decile, (predicted_m, observed_m) in enumerate(
+        uncertainty_calibration.reliability(errors.sigma_m, errors.error_m)
+    ):
+        rows.append(Row("reliability", robot, f"decile {decile}", -1, "predicted_rms_m", predicted_m))
+        rows.append(Row("reliability", robot, f"decile {decile}", -1, "observed_rms_m", observed_m))
+    return rows

@@ -1,0 +1,79 @@
+"""A session that is killed begins again, takes what was slow from its checkpoints, and writes the same bytes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from duagc.pipeline.base import recall
+from duagc.pipeline.base.checkpoints import Checkpoints
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.exchange import detected_loop_closures, sharing
+from duagc.pipeline.exchange.session import run_session_of
+from duagc.pipeline.recording import content_digest
+
+SLOW = {detected_loop_closures: ("extract", "verify"), sharing: ("own_records", "match_pairs")}
+
+
+class KilledError(Exception):
+    """In place of a signal."""
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the slow functions, as they are called; however fast they are, their results are kept."""
+    made: list[str] = []
+
+    def counted(name: str, function: Any) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            made.append(name)
+            return function(*args, **kwargs)
+
+        return call
+
+    for module, names in SLOW.items():
+        for name in names:
+            monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
+    monkeypatch.setattr(recall, "WORTH_S", 0.0)
+    return made
+
+
+def test_nothing_slow_is_computed_twice(make_robot: Any, tmp_path: Path, calls: list[str]) -> None:
+    team = [make_robot(name, 0.6 * i, keyframes=4)[0] for i, name in enumerate(("alpha", "bravo"))]
+    said: list[str] = []
+
+    def meet(folder: Path, most: float, checkpoints: Path | None) -> str | None:
+        """Digest of both logs; None if it was killed after so many results."""
+        folder.mkdir(exist_ok=True)
+
+        def report(part: str, done: int, total: int, shown: object) -> None:
+            if done > most:
+                raise KilledError
+
+        save = Checkpoints(checkpoints, say=said.append, every_s=0.0, largest_share=math.inf, report=report)
+        logs = folder / "exchange.mcap", folder / "consensus.mcap"
+        try:
+            run_session_of(
+                team,
+                ExchangeConfig(),
+                seed=0,
+                exchange_path=logs[0],
+                consensus_path=logs[1],
+                checkpoints=save,
+            )
+        except KilledError:
+            return None
+        return " ".join(map(content_digest, logs))
+
+    expected = meet(tmp_path / "undisturbed", math.inf, None)
+    once = sorted(calls)
+    assert set(once) == {"extract", "verify", "own_records", "match_pairs"}
+    calls.clear()
+    killed = [meet(tmp_path / "killed", most, tmp_path / "saved") for most in (3, 8, len(once) - 1)]
+    assert killed == [None] * 3
+    assert meet(tmp_path / "killed", math.inf, tmp_path / "saved") == expected
+    assert len(calls) == len(once) + 3  # what a kill falls into is not saved
+    assert said[-1] == f"session: goes on with {len(once) - 1} results"
