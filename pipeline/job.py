@@ -247,6 +247,7 @@ class Job:
             sizes = self._sizes(absent)
             workers = self._fitting(sizes)
             self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
+            self._check_registration(absent)
             self._time_left = times = self._expected(sizes, found, workers)
             preparation = Preparation(
                 self.recording.path, self.folder, self.config, self.plan, self._place, self._where
@@ -260,6 +261,16 @@ class Job:
                 f"warning: {name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
             )
         return dict(sorted(found.items()))
+
+    def _check_registration(self, robots: Sequence[str]) -> None:
+        """Say where color and depth do not belong together, unless they are calibrated."""
+        if self.plan.calibrate:
+            return
+        from duagc.pipeline.checks.check import check_registration
+
+        for robot in robots:
+            for finding in check_registration(self.recording.log(robot)):
+                self.log(finding.line())
 
     def _expected(
         self, sizes: dict[str, dict[str, int]], found: dict[str, Prepared], workers: int

@@ -174,7 +174,8 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         _part(
             "job",
             "a run that is made",
-            "base config runs recording evaluation viewing cache steps watch time_left chain preparation run_plan",
+            "base config runs recording evaluation viewing checks cache steps watch time_left chain preparation",
+            "run_plan",
         ),
     ),
     (

@@ -18,7 +18,7 @@ from duagc.pipeline.recording import Recording, RgbdLog, log_metadata, open_rgbd
 from duagc.pipeline.recording.names import DIGEST_RECORD
 from duagc.pipeline.recording.read import LogFile
 
-__all__ = ["Finding", "Report", "Severity", "check", "format_report"]
+__all__ = ["Finding", "Report", "Severity", "check", "check_registration", "format_report"]
 
 _DEFAULT = ChecksConfig()
 
@@ -56,6 +56,21 @@ def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = N
     report.findings += estimate.check_disk(path.parent, report.estimate["bytes"])
     report.findings = list(judged(report.findings, config.sure, config.likely))
     return report
+
+
+def check_registration(log: Path, config: ChecksConfig = _DEFAULT) -> list[Finding]:
+    """Whether color and depth of a log are of one time and place; a second or two, before a run begins.
+
+    Args:
+        log: of a robot.
+        config: from which value on something is reported.
+
+    Raises:
+        DuagError: the log is damaged.
+    """
+    with open_rgbd(log) as rgbd:
+        found = list(geometry.check_edges(rgbd.robot, geometry.edges_of(rgbd, config.edges), config.edges))
+    return list(judged(found, config.sure, config.likely))
 
 
 def _unreadable(robot: str, error: DuagError, advice: str) -> Finding:

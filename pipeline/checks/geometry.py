@@ -328,7 +328,7 @@ def check_edges(robot: str, edges: DepthEdges | None, config: EdgeChecks) -> Ite
             f"edges of color fit the depth {abs(shift)} frames {'later' if shift > 0 else 'earlier'} better by "
             f"{edges.by_frames[frames] / edges.by_frames[shifts] - 1:.0%}",
             "best fit at its own time",
-            "color and depth are of different times; correct the times of one of them",
+            "color and depth are of different times: `duagc run --calibrate` estimates the delay",
             confidence=_agreeing(edges.frames_of, frames, shifts),
         )
     elif edges.by_pixels[pixels] > config.clear_ratio * edges.by_pixels[reach] and abs(pixels - reach) > 2:
@@ -339,7 +339,7 @@ def check_edges(robot: str, edges: DepthEdges | None, config: EdgeChecks) -> Ite
             f"edges of color fit the depth {pixels - reach:+d} px to the right better by "
             f"{edges.by_pixels[pixels] / edges.by_pixels[reach] - 1:.0%}",
             "best fit where it is",
-            "register the depth to the color camera",
+            "register the depth to the color camera; `duagc run --calibrate` estimates how it is turned",
             confidence=_agreeing(edges.pixels_of, pixels, reach),
         )
 

@@ -15,11 +15,15 @@ import pytest
 from typer.testing import CliRunner
 
 from duagc.converters.simulate.team import simulate
+from duagc.pipeline import job
 from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks import check
 from duagc.pipeline.cli import app
+from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.recording import LogWriter, Record, read_log
+from duagc.pipeline.recording import LogWriter, Record, Recording, read_log
+from duagc.pipeline.run_plan import RunPlan
 from duagc.schemas import topics
 
 FRAMES = 20
@@ -204,6 +208,24 @@ def test_a_sound_recording_raises_no_alarm(sound: Path, tmp_path: Path) -> None:
     assert check.check(sound).plain() == report.plain()
     again = check.check(planted(sound, tmp_path / "rec", nothing))  # the metadata of the log are lost
     assert [f.check for f in again.findings] == ["digest"]
+
+
+@pytest.mark.parametrize(("change", "calibrate"), [(nothing, False), (late_depth, False), (late_depth, True)])
+def test_a_run_says_before_it_begins_that_depth_is_of_another_time(
+    sound: Path, tmp_path: Path, change: Change, calibrate: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*args: Any, **kwargs: Any) -> Any:
+        raise DuagError("stopped")
+
+    monkeypatch.setattr(job.Preparation, "run", stop)
+    recording = Recording(planted(sound, tmp_path / "rec", change))
+    lines: list[str] = []
+    plan = RunPlan(workers=1, calibrate=calibrate)
+    with pytest.raises(DuagError, match="stopped"):
+        job.Job(recording, tmp_path, RunConfig(), plan, log=lines.append, place=tmp_path).stages()
+    said = [line for line in lines if "depth in time" in line]
+    assert [" bravo: " in line for line in said] == [True] * (change is late_depth and not calibrate)
+    assert all("duagc run --calibrate" in line for line in said)
 
 
 def test_logs_that_cannot_be_read_are_findings(sound: Path, tmp_path: Path) -> None:
