@@ -130,7 +130,12 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             _LOGS,
             "evaluation cache runs",
         ),
-        _part("bench", "speed, side by side", _MATHEMATICS, "recording runs frontend evaluation converters"),
+        _part(
+            "bench",
+            "speed, side by side",
+            _MATHEMATICS,
+            "schemas recording runs frontend evaluation converters",
+        ),
     ),
     (
         _part(

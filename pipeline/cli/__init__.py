@@ -18,6 +18,7 @@ from duagc.pipeline.cli import inspect
 from duagc.pipeline.cli import posegraph
 from duagc.pipeline.cli import settings
 from duagc.pipeline.cli import bench
+from duagc.pipeline.cli import bench_runs
 from duagc.pipeline.cli import robustness
 # isort: on
 
@@ -25,6 +26,7 @@ __all__ = [
     "app",
     "batch",
     "bench",
+    "bench_runs",
     "compare",
     "experiment",
     "inspect",

@@ -44,8 +44,8 @@ def bench_raster(
             )
     plan = raster.RasterPlan(
         sizes=tuple(sizes_of(sizes)),
-        gaussians=tuple(_counts("--gaussians", "60k,300k,1M" if full else gaussians)),
-        threads=tuple(_counts("--threads", threads)),
+        gaussians=tuple(counts("--gaussians", "60k,300k,1M" if full else gaussians)),
+        threads=tuple(counts("--threads", threads)),
         rounds=max(rounds, 15) if full else rounds,
         torch_too=not no_torch,
         isas=tuple(isas),
@@ -94,7 +94,7 @@ def bench_consensus(
             if word not in known:
                 raise typer.BadParameter(f"{word!r} is not one of {', '.join(known)}", param_hint=option)
     plan = consensus_modes.ConsensusPlan(
-        robots=tuple(_counts("--robots", robots)),
+        robots=tuple(counts("--robots", robots)),
         topologies=tuple(topology.split(",")),
         losses=tuple(numbers("--loss", loss, 0.0, 0.99)),
         contrasts=tuple(numbers("--contrast", contrast, 1.0, 1e8)),
@@ -219,7 +219,7 @@ def bench_frontend(
     from duagc.pipeline.config.run import RunConfig
 
     settings = load_config(RunConfig, config, overrides or [])
-    chosen = () if caps == "none" else tuple(_counts("--caps", caps))
+    chosen = () if caps == "none" else tuple(counts("--caps", caps))
     if plot is not None:
         if not chosen:
             raise typer.BadParameter("there is nothing to draw without maps; see --caps", param_hint="--plot")
@@ -280,11 +280,11 @@ def bench_paths(
             raise typer.BadParameter(
                 f"{name!r} is not one of {', '.join(PARADIGMS[1:])}", param_hint="--paradigms"
             )
-    counts = _counts("--robots", robots)
-    if max(counts) > MAX_ROBOTS:
-        raise typer.BadParameter(f"{max(counts)} is more than {MAX_ROBOTS}", param_hint="--robots")
+    teams = counts("--robots", robots)
+    if max(teams) > MAX_ROBOTS:
+        raise typer.BadParameter(f"{max(teams)} is more than {MAX_ROBOTS}", param_hint="--robots")
     asked = numbers("--overlap", overlap, 0, 1)
-    rows = paths.run(scenes.split(","), paradigms.split(","), counts, asked, frames=frames, seed=seed, up=up)
+    rows = paths.run(scenes.split(","), paradigms.split(","), teams, asked, frames=frames, seed=seed, up=up)
     print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
 
 
@@ -326,7 +326,7 @@ def numbers(option: str, text: str, low: float, high: float) -> list[float]:
     return numbers
 
 
-def _counts(option: str, text: str) -> list[int]:
+def counts(option: str, text: str) -> list[int]:
     """Positive numbers out of text like 60k,1M."""
     counts = []
     for word in text.split(","):

@@ -1,0 +1,81 @@
+"""Commands that measure whole runs: for every second of log, and as logs get longer."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from duagc.pipeline.cli.bench import counts, numbers
+from duagc.pipeline.cli.common import Json, Overrides, bench_app
+
+Recorded = Annotated[Path, typer.Argument(help="Folder of a recording.", show_default=False)]
+
+
+def _options(overrides: list[str] | None) -> list[str]:
+    return [word for override in overrides or [] for word in ("--set", override)]
+
+
+@bench_app.command("realtime")
+def bench_realtime(
+    recording: Recorded,
+    robots: Annotated[str, typer.Option(help="Sizes of the team: the first robots by name.")] = "1,2",
+    threads: Annotated[str, typer.Option(help="Processors that a run may use.")] = "1,2",
+    beside: Annotated[
+        Path | None,
+        typer.Option(help="`duagc` of another version, which runs the same in turn.", show_default=False),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Of every log; else all of it.", show_default=False)
+    ] = None,
+    no_open3d: Annotated[bool, typer.Option("--no-open3d", help="Without Open3D's odometry.")] = False,
+    no_evaluation: Annotated[
+        bool, typer.Option("--no-evaluation", help="Without metrics and report (not with --beside).")
+    ] = False,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Whole runs, stage by stage, in seconds for every second of log: below 1 a team is mapped as fast as it records.
+
+    Lists are separated by commas; every combination is a run with nothing from any store. Needs an idle machine.
+
+    Examples: `duagc bench realtime recordings/redkitchen`,
+    `duagc bench realtime recordings/office8 --robots 1,2,4,8 --threads 2 --seconds 4`,
+    `duagc bench realtime recordings/redkitchen --robots 2 --threads 2 --beside ../before/.venv/bin/duagc`
+    """
+    from duagc.pipeline.bench import realtime
+
+    if no_evaluation and beside is not None:
+        raise typer.BadParameter("other versions may not know it", param_hint="--no-evaluation")
+    plan = realtime.RealtimePlan(
+        recording,
+        tuple(counts("--robots", robots)),
+        tuple(counts("--threads", threads)),
+        beside=beside,
+        open3d=not no_open3d,
+        seconds=seconds,
+        options=(*_options(overrides), *(["--no-evaluation"] if no_evaluation else [])),
+    )
+    result = realtime.run(plan)
+    print(json.dumps(result, indent=2) if as_json else realtime.format_table(result))
+
+
+@bench_app.command("length")
+def bench_length(
+    recording: Recorded,
+    seconds: Annotated[str, typer.Option(help="Lengths of the logs, from their beginning.")],
+    threads: Annotated[int, typer.Option(min=1, help="Processors that a run may use.")] = 2,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Time, memory and accuracy of whole runs against the length of their logs.
+
+    Lengths are separated by commas. "more" is the processor time of every further second of log.
+
+    Example: `duagc bench length recordings/redkitchen --seconds 2.5,5,10`
+    """
+    from duagc.pipeline.bench import length
+
+    lengths = tuple(numbers("--seconds", seconds, 0.1, 1e6))
+    result = length.run(length.LengthPlan(recording, lengths, threads, tuple(_options(overrides))))
+    print(json.dumps(result, indent=2) if as_json else length.format_table(result))

@@ -1,0 +1,135 @@
+"""`duagc bench realtime` and `length`: parts of recordings are what they say, and figures those of the runs."""
+
+from __future__ import annotations
+
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from duagc.converters.simulate.team import simulate
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.bench import length, realtime, whole_runs
+from duagc.pipeline.cli import app
+from duagc.pipeline.recording import Recording, content_digest, open_rgbd
+
+COMMAND = """#!{python}
+import json, os, sys
+recording, out, workers = sys.argv[2], sys.argv[4], int(sys.argv[6])
+robots = sorted(json.load(open(recording + "/recording.json"))["robots"])
+if "--fail" in sys.argv:
+    sys.exit("duagc: no such thing")
+os.mkdir(out)
+row = dict(wall_s=1.0, peak_rss_mb=100.0 * workers, executed=True)
+parts = dict(tracking_s=0.1, mapping_s=0.3, refinement_s=0.1, model_s=0.1, final_refinement_s=0.4)
+stages = {{f"frontend.{{r}}": row | dict(stage="frontend", robot=r, cpu_s={cost}, parts=parts) for r in robots}}
+stages["exchange"] = row | dict(stage="exchange", robot=None, cpu_s=float(len(os.sched_getaffinity(0))))
+json.dump(dict(stages=stages), open(out + "/timing.json", "w"))
+own = dict(held_out=dict(psnr_db=30.0, depth_l1_m=0.01))
+team = dict(robots_in_largest_component=len(robots), ate_rmse_m=None)
+metrics = dict(rendering=dict(own=own), team=team, robots={{r: dict(frames=5, gaussians=7) for r in robots}})
+json.dump(metrics, open(out + "/metrics.json", "w"))
+"""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    out = tmp_path_factory.mktemp("runs") / "room"
+    simulate(out, robots=2, frames=10, size=(64, 48), seed=1, workers=1)
+    return Recording(out)
+
+
+def command(folder: Path, cost: float) -> Path:
+    """A `duagc` whose front ends take so long."""
+    path = folder / f"duagc{cost}"
+    path.write_text(COMMAND.format(python=sys.executable, cost=cost))
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+def test_a_part_is_the_beginning_of_the_first_robots(recording: Recording, tmp_path: Path) -> None:
+    before = {robot: content_digest(recording.log(robot)) for robot in recording.robots}
+    part = whole_runs.part_of(recording, 1, 0.15, tmp_path / "part")
+    assert part.robots == ["alpha"]
+    with open_rgbd(part.log("alpha")) as log, open_rgbd(recording.log("alpha")) as whole:
+        assert len(log) == part.description["robots"]["alpha"]["frames"] == 5  # at 0, 1/30, .. 4/30 s
+        for k in range(len(log)):
+            assert (log.frame(k).color == whole.frame(k).color).all()
+            assert (log.frame(k).depth == whole.frame(k).depth).all()
+    assert part.digest("alpha.mcap") == content_digest(part.log("alpha")) != before["alpha"]
+    assert part.groundtruth("alpha") is not None
+    assert part.geometry() is not None
+    assert whole_runs.seconds_of(part)["alpha"] == pytest.approx(0.15)
+    linked = whole_runs.part_of(recording, 2, None, tmp_path / "whole")
+    assert {robot: content_digest(linked.log(robot)) for robot in linked.robots} == before
+    with pytest.raises(DuagError, match="has 2 robots, expected 3 or more"):
+        whole_runs.part_of(recording, 3, None, tmp_path / "three")
+
+
+def test_realtime_is_the_time_of_runs_by_the_time_of_logs(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(realtime, "THIS", (str(command(tmp_path, 3.0)),))
+    plan = realtime.RealtimePlan(
+        recording.path, (1, 2), (1,), beside=command(tmp_path, 6.0), open3d=False, seconds=0.2
+    )
+    result = realtime.run(plan)
+    assert [(r["version"], r["robots"]) for r in result["rows"]] == [
+        ("this", 1), ("beside", 1), ("this", 2), ("beside", 2),
+    ]  # fmt: skip
+    for row, whole in zip(result["rows"], (3.0 + 1, 6.0 + 1, 6.0 + 1, 12.0 + 1), strict=True):
+        log_s = 0.2 * row["robots"]
+        found = row["cpu_s_per_s"]
+        front = whole - 1
+        assert found["tracking"] == pytest.approx(0.1 * front / log_s, abs=1e-3)
+        assert found["poses"] == pytest.approx(0.2 * front / log_s, abs=1e-3)
+        assert found["final"] == pytest.approx(0.4 * front / log_s, abs=1e-3)
+        assert found["exchange"] == pytest.approx(1 / log_s, abs=1e-3)  # one processor was allowed
+        assert found["whole"] == pytest.approx(whole / log_s, abs=1e-3)
+        assert row["peak_memory_mb"] == 100.0
+    lines = realtime.format_table(result).splitlines()
+    ratios = [line for line in lines if "this : beside" in line]
+    assert len(ratios) == 2
+    assert all("0.50x" in line for line in ratios)
+
+
+def test_length_says_what_a_further_second_costs(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(length, "THIS", (str(command(tmp_path, 3.0)),))
+    result = length.run(length.LengthPlan(recording.path, (0.3, 0.1), threads=1))
+    assert [row["seconds"] for row in result["rows"]] == [0.1, 0.3]
+    assert [row["cpu_s"] for row in result["rows"]] == [
+        3.5,
+        3.5,
+    ]  # of a robot, its share of the exchange with it
+    assert result["rows"][1]["more_cpu_s_per_s"] == 0.0
+    assert " - |" in length.format_table(result).splitlines()[2]  # no ground truth, no ATE
+    with pytest.raises(DuagError, match=r"shortest log has 0\.3 s, expected 9 s or more"):
+        length.run(length.LengthPlan(recording.path, (9.0,)))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["realtime", "--robots", "3"], "has 2 robots, expected 3 or more"),
+        (["realtime", "--beside", "/nowhere/duagc"], "/nowhere/duagc: no such command"),
+        (["realtime", "--robots", "none"], "'none' is not a positive number"),
+    ],
+)
+def test_what_cannot_be_run_is_said_at_once(recording: Recording, words: list[str], said: str) -> None:
+    result = CliRunner().invoke(app, ["bench", words[0], str(recording.path), *words[1:]])
+    assert result.exit_code
+    assert said in f"{result.output} {result.exception}"
+
+
+def test_a_command_that_fails_is_named_with_its_last_line(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing = command(tmp_path, 1.0)
+    monkeypatch.setattr(realtime, "THIS", (str(failing),))
+    plan = realtime.RealtimePlan(recording.path, (1,), (1,), open3d=False, options=("--fail",))
+    with pytest.raises(DuagError, match="said 'duagc: no such thing' and ended with 1"):
+        realtime.run(plan)
