@@ -19,7 +19,7 @@ from duagc.pipeline.runs.folder import position_information
 WORST_CONDITION = 1e12
 MIN_GAUSSIANS = 100
 NAMES = (
-    "ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95",
+    "ece_paper", "ece_rank", "ece_rank_if_right", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95",
     "nll_scaled", "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information",
 )  # fmt: skip
 
@@ -99,6 +99,9 @@ def scores(errors: MapErrors, robot: str) -> dict[str, Any]:
     return {
         "ece_paper": uncertainty_calibration.ece_paper(errors.paper_uncertainty, error),
         "ece_rank": uncertainty_calibration.ece_rank(sigma, error),
+        "ece_rank_if_right": uncertainty_calibration.ece_rank(
+            sigma, uncertainty_calibration.if_right(sigma, robot)
+        ),
         "ece_rank_shuffled": uncertainty_calibration.ece_rank(
             uncertainty_calibration.shuffled(sigma, robot), error
         ),

@@ -64,7 +64,7 @@ def fitted_scale(sigma_m: Array, error_m: Array) -> float:
 def ece_rank(sigma_m: Array, error_m: Array) -> float:
     """Ten bins of equal count by predicted uncertainty; mean |mean uncertainty rank - mean error rank|, ranks 0..1.
 
-    0 if the order is right, 0.25 if the uncertainty says nothing.
+    0 if the order is right, 0.25 if the uncertainty says nothing; what right ones reach: `if_right`.
     """
     n = len(sigma_m)
     order = np.argsort(sigma_m, kind="stable")
@@ -77,6 +77,19 @@ def ece_rank(sigma_m: Array, error_m: Array) -> float:
 def shuffled(sigma_m: Array, name: str) -> Array:
     """The same uncertainties dealt out at random (seed 0): what a metric says when there is no information."""
     return random_streams.generator(0, "calibration-shuffle", of=name).permutation(sigma_m)
+
+
+def if_right(sigma_m: Array, name: str) -> Array:
+    """Errors that the uncertainties themselves would make, were they exactly right (seed 0): what a metric can reach.
+
+    An error is drawn once, so that even right uncertainties order errors only as far as they differ from each other.
+
+    Args:
+        sigma_m: predicted standard deviations [n].
+        name: of the random stream.
+    """
+    draws = random_streams.generator(0, "calibration-right", of=name).standard_normal(len(sigma_m))
+    return np.asarray(np.abs(draws) * sigma_m)
 
 
 def ece_paper(uncertainty: Array, error_m: Array) -> float:

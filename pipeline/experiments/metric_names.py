@@ -31,8 +31,8 @@ _CONSENSUS = (
     "rejected_matches_share"
 )
 _CALIBRATION = (
-    "ece_paper ece_rank ece_rank_shuffled spearman ause nll coverage_95 nll_scaled coverage_95_scaled "
-    "sigma_scale gaussians gaussians_without_information"
+    "ece_paper ece_rank ece_rank_if_right ece_rank_shuffled spearman ause nll coverage_95 nll_scaled "
+    "coverage_95_scaled sigma_scale gaussians gaussians_without_information"
 )
 
 

@@ -60,7 +60,7 @@ SCHEMA = {
         "own_unrefined": {"held_out": VIEWS},
     },
     "calibration": dict.fromkeys(
-        ("ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
+        ("ece_paper", "ece_rank", "ece_rank_if_right", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
          "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information"),
         NUMBER,
     ),
@@ -247,6 +247,7 @@ def test_calibration_finds_that_the_information_is_right(metrics):
     assert calibration["sigma_scale"] == pytest.approx(1.0, abs=0.04)
     assert calibration["spearman"] > 0.5
     assert calibration["ece_rank"] < 0.15 < 0.22 < calibration["ece_rank_shuffled"]
+    assert calibration["ece_rank"] == pytest.approx(calibration["ece_rank_if_right"], abs=0.01)
 
 
 def test_the_exchange_is_counted(metrics):

@@ -74,3 +74,12 @@ def test_the_companion_codes_formula():
     error = np.array([0.0, 1.0, 0.5])
     # bins [0, 0.1): mean u 0.025, mean e 0.5, two values; [0.9, 1]: u 1, e 0.5
     assert uncertainty_calibration.ece_paper(uncertainty, error) == pytest.approx((2 * 0.475 + 0.5) / 3)
+
+
+@pytest.mark.parametrize(("spread", "reached"), [(0.0, 0.25), (0.5, 0.14), (1.0, 0.08), (2.0, 0.035)])
+def test_right_uncertainties_order_errors_only_as_far_as_they_differ(spread, reached):
+    """By log-normal uncertainties of so much spread, in units of the natural logarithm."""
+    sigma = np.exp(spread * np.random.default_rng(0).standard_normal(20_000))
+    right = uncertainty_calibration.if_right(sigma, "test")
+    assert np.sqrt(np.mean((right / sigma) ** 2)) == pytest.approx(1.0, abs=0.02)
+    assert uncertainty_calibration.ece_rank(sigma, right) == pytest.approx(reached, abs=0.01)
