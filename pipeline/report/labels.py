@@ -150,7 +150,7 @@ CALIBRATION = {
     "spearman": ("Spearman", "rank correlation of predicted and observed error; 1 is perfect, 0 knows nothing"),
     "ause": ("AUSE", "cost of trusting the predicted order of errors; 0 is perfect"),
     "ece_rank": ("ECE, ranks", "gap between predicted and observed rank per decile; 0 is perfect, 0.25 knows nothing"),
-    "ece_rank_if_right": ("ECE, ranks, if right", "the same of errors drawn from the predictions: what right ones reach"),
+    "ece_rank_if_right": ("ECE, ranks, if right", "the same of errors drawn from the predictions"),
     "ece_rank_shuffled": ("ECE, ranks, shuffled", "the same with the predictions dealt out at random"),
     "ece_paper": ("ECE, companion code", "the paper's formula, for comparison only: near 0 without any knowledge, too"),
     "coverage_95": ("Coverage of 95 %", "share of errors within 1.96 predicted σ, as predicted"),

@@ -60,7 +60,8 @@ SCHEMA = {
         "own_unrefined": {"held_out": VIEWS},
     },
     "calibration": dict.fromkeys(
-        ("ece_paper", "ece_rank", "ece_rank_if_right", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
+        ("ece_paper", "ece_rank", "ece_rank_if_right", "ece_rank_shuffled", "spearman", "ause", "nll",
+         "coverage_95", "nll_scaled",
          "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information"),
         NUMBER,
     ),
