@@ -10,6 +10,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 
 Depth = Array
 
+STRIP_ROWS = 32  # drawn at a time: what is computed of them stays in the cache
 CONNECTED_RATIO = 0.03  # neighboring depths that differ by less than this share of the nearer are one surface
 
 
@@ -38,17 +39,20 @@ class DepthRegistration:
         """Depth [h, w] in meters of the depth camera, 0 where none -> depth [H, W] in meters of the color camera."""
         with np.errstate(divide="ignore"):
             w = np.where(depth > 0, 1.0 / depth, 0.0)
-        w = self._resample_rows(w)
         out = np.zeros(self._shape)
-        self._draw_segments(w, out)
+        for top in range(0, len(out), STRIP_ROWS):
+            rows = slice(top, top + STRIP_ROWS)
+            self._draw_segments(self._resample_rows(w, rows), out[rows])
         with np.errstate(divide="ignore"):
             return np.where(out > 0, 1.0 / out, 0.0)
 
-    def _resample_rows(self, w: Depth) -> Depth:
-        upper, lower, part = w[self._row_near], w[self._row_near + 1], self._row_part
+    def _resample_rows(self, w: Depth, rows: slice) -> Depth:
+        upper, lower, part = w[self._row_near[rows]], w[self._row_near[rows] + 1], self._row_part[rows]
         nearest = np.where(part < 0.5, upper, lower)
         between = _connected(upper, lower) & (part >= 0) & (part <= 1)
-        return np.where(self._row_inside, np.where(between, upper + part * (lower - upper), nearest), 0.0)
+        return np.where(
+            self._row_inside[rows], np.where(between, upper + part * (lower - upper), nearest), 0.0
+        )
 
     def _draw_segments(self, w: Depth, out: Depth) -> None:
         x = self._zoom * self._columns + self._offset - self._shift_px_m * w
@@ -69,9 +73,9 @@ class DepthRegistration:
         self._keep_nearest(out, covered & (w > 0), nearest, w)
 
     def _keep_nearest(self, out: Depth, mask: NDArray[np.bool_], column: Depth, w: Depth) -> None:
-        mask = mask & (column >= 0) & (column < self._shape[1])
-        rows = np.nonzero(mask)[0]
-        np.maximum.at(out, (rows, column[mask].astype(int)), w[mask])
+        drawn = np.flatnonzero(mask & (column >= 0) & (column < self._shape[1]))
+        rows, columns = drawn // mask.shape[1], column.ravel()[drawn].astype(np.int64)
+        np.maximum.at(out.ravel(), rows * out.shape[1] + columns, w.ravel()[drawn])
 
 
 def _connected(w_a: Depth, w_b: Depth) -> NDArray[np.bool_]:
