@@ -17,7 +17,7 @@ them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import MapMatching
-from duagc.pipeline.consensus.colors import team_colors
+from duagc.pipeline.consensus.colors import ColorMap, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY
@@ -108,14 +108,21 @@ def threshold(own: Evidence, config: MapMatching) -> float:
     """tau_G of a map: how much its own neighboring Gaussians differ; 0 if no two are within the radius."""
     if len(own) < 2:
         return 0.0
-    means = own.theta[:, MEAN]
+    near, other = _neighbors(own.theta[:, MEAN], config.radius_m)
+    return _threshold(_Chart.of(own.theta, config) if len(near) else None, near, other, config)
+
+
+def _neighbors(means: Array, radius_m: float) -> tuple[Index, Index]:
+    """Rows that have a nearest other one within the radius, and that one."""
     distance, neighbor = cKDTree(means).query(means, k=2)
-    near = np.flatnonzero(distance[:, 1] <= config.radius_m)
-    if not len(near):
-        return 0.0
+    near = np.flatnonzero(distance[:, 1] <= radius_m)
     # of coinciding Gaussians the query may name the Gaussian itself second
-    other = np.where(neighbor[near, 1] == near, neighbor[near, 0], neighbor[near, 1])
-    chart = _Chart.of(own.theta, config)
+    return near, np.where(neighbor[near, 1] == near, neighbor[near, 0], neighbor[near, 1])
+
+
+def _threshold(chart: _Chart | None, near: Index, other: Index, config: MapMatching) -> float:
+    if chart is None or not len(near):
+        return 0.0
     return float(np.percentile(_distances((chart, chart), near, other, config), config.percentile))
 
 
@@ -131,24 +138,62 @@ def match(own: Evidence, peer: Evidence, config: MapMatching) -> Index:
     """
     if not len(own) or not len(peer):
         return np.zeros((0, 2), np.int64)
+    both = _Both.of(own, peer, config)
     if config.colors.enabled and config.beta_color > 0:
-        blind = _match(own, peer, config.model_copy(update={"beta_color": 0.0}))
+        blind = both.matched(config.model_copy(update={"beta_color": 0.0}))
         a, b = "own", "peer"
-        peer = team_colors({a: own, b: peer}, {(a, b): blind}, config.colors).between(b, a).of(peer)
-    return _match(own, peer, config)
+        both = both.in_colors(team_colors({a: own, b: peer}, {(a, b): blind}, config.colors).between(b, a))
+    return both.matched(config)
 
 
-def _match(own: Evidence, peer: Evidence, config: MapMatching) -> Index:
-    """`match` of evidence in the same colors, not empty."""
-    i, j = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
-    d = _distances((_Chart.of(own.theta, config), _Chart.of(peer.theta, config)), i, j, config)
-    close = d < threshold(own, config)
-    i, j, d = i[close], j[close], d[close]
-    best_of_own = _first_of_each(i, d, peer.ids[j])
-    best_of_peer = _first_of_each(j, d, own.ids[i])
-    mutual = np.intersect1d(best_of_own, best_of_peer)
-    pairs = np.stack([own.ids[i[mutual]], peer.ids[j[mutual]]], axis=1)
-    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+@dataclass(frozen=True)
+class _Both:
+    """Two maps that are matched, none empty: candidates and charts, which do not depend on colors but hold them.
+
+    Attributes:
+        own: evidence of the computing robot.
+        peer: of the other one.
+        charts: of both.
+        candidates: rows of both.
+        neighbors: rows of the own map and of their nearest other ones; empty where there is but one Gaussian.
+    """
+
+    own: Evidence
+    peer: Evidence
+    charts: tuple[_Chart, _Chart]
+    candidates: tuple[Index, Index]
+    neighbors: tuple[Index, Index]
+
+    @staticmethod
+    def of(own: Evidence, peer: Evidence, config: MapMatching) -> _Both:
+        nobody = np.zeros(0, np.int64)
+        return _Both(
+            own,
+            peer,
+            (_Chart.of(own.theta, config), _Chart.of(peer.theta, config)),
+            _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config),
+            (nobody, nobody) if len(own) < 2 else _neighbors(own.theta[:, MEAN], config.radius_m),
+        )
+
+    def in_colors(self, colors: ColorMap) -> _Both:
+        """With the peer's Gaussians in other colors."""
+        peer = colors.of(self.peer)
+        theta = self.charts[1].theta.copy()
+        theta[:, COLOR] = peer.theta[:, COLOR]
+        return replace(self, peer=peer, charts=(self.charts[0], replace(self.charts[1], theta=theta)))
+
+    def matched(self, config: MapMatching) -> Index:
+        """Ids of (own, peer), as `match`."""
+        own, peer = self.own, self.peer
+        i, j = self.candidates
+        d = _distances(self.charts, i, j, config)
+        close = d < _threshold(self.charts[0], *self.neighbors, config)
+        i, j, d = i[close], j[close], d[close]
+        best_of_own = _first_of_each(i, d, peer.ids[j])
+        best_of_peer = _first_of_each(j, d, own.ids[i])
+        mutual = np.intersect1d(best_of_own, best_of_peer)
+        pairs = np.stack([own.ids[i[mutual]], peer.ids[j[mutual]]], axis=1)
+        return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
 def _candidates(means_own: Array, means_peer: Array, config: MapMatching) -> tuple[Index, Index]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +18,9 @@ from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages import GaussianInformation, GaussianMap, Keyframe, KeyframeFactor
 from duagc.pipeline.posegraph.relative_poses import RelativePose
+from duagc.pipeline.runs.keyframe_images import Images, KeyframeImages
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.schemas import topics
-
-
-class Images(NamedTuple):
-    """Images of a keyframe: RGB [h, w, 3], depth [h, w] (m, 0 = unknown), its sigma (m) where the log has it, and the
-    pixels that may be used, bool [h, w]; None: all."""
-
-    color: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
-    depth_sigma_m: NDArray[np.float32] | None = None
-    mask: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -201,13 +191,12 @@ def _tied(factors: Sequence[KeyframeFactor]) -> set[int]:
 
 
 def load(source: AgentInput) -> RobotData:
-    """One robot's files in memory; its sensor log is opened again for every image that is asked for.
+    """One robot's files in memory; its sensor log is opened when an image is asked for.
 
     Raises:
         DuagError: a file lacks what it should hold, or two files do not belong together.
     """
     from duagc.pipeline.recording import open_rgbd, read_log
-    from duagc.pipeline.recording.moved_depth import tracked_frames
 
     robot = source.robot
     wanted = (topics.KEYFRAME.of(robot), topics.MAP.of(robot), topics.KEYFRAME_FACTOR.of(robot))
@@ -239,16 +228,8 @@ def load(source: AgentInput) -> RobotData:
     poses = np.array([k.T_map_camera for k in keyframes], dtype=np.float64).reshape(-1, 4, 4)
     with open_rgbd(source.log) as log:
         camera = log.camera
-        frames = tracked_frames(source.frontend) if log.pairing.largest_offset_ns else None
         if log.robot != robot_of(robot):
             raise DuagError(f"{source.log}: is the log of {log.robot}, expected that of {robot_of(robot)}")
-
-    def images(keyframe: int) -> Images:
-        with open_rgbd(source.log) as log:
-            if frames is not None:
-                log.move_depth(frames)
-            frame = log.frame(keyframes[keyframe].frame_index)
-        return Images(frame.color, frame.usable_depth, frame.depth_sigma, frame.mask)
 
     return RobotData(
         robot,
@@ -256,7 +237,7 @@ def load(source: AgentInput) -> RobotData:
         poses,
         odometry=odometry_of(keyframes),
         registrations=registrations,
-        images=images,
+        images=KeyframeImages(source.log, source.frontend, [k.frame_index for k in keyframes]),
         gaussians=gaussian_map.gaussians,
         information=information,
         depth=gaussian_map.depth,

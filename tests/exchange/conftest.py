@@ -15,7 +15,8 @@ from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages import GaussianInformation
 from duagc.pipeline.posegraph.relative_poses import RelativePose
-from duagc.pipeline.runs.robot_data import Images, RobotData
+from duagc.pipeline.runs.keyframe_images import Images
+from duagc.pipeline.runs.robot_data import RobotData
 from duagc.pipeline.splat.gaussians import Gaussians
 
 MakeRobot = Callable[..., tuple[RobotData, Array]]

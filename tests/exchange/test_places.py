@@ -21,7 +21,7 @@ from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import features
-from duagc.pipeline.runs.robot_data import Images
+from duagc.pipeline.runs.keyframe_images import Images
 
 
 @pytest.fixture(scope="module")
