@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from duagc.pipeline.base.machine import cores
+from duagc.pipeline.base.machine import cores, processors
 from duagc.pipeline.cache import durations
 from duagc.pipeline.cache.durations import Size
 from duagc.pipeline.config.mapping import MappingConfig
@@ -96,7 +96,8 @@ class TimeLeft:
         evaluated = durations.side_by_side_s(
             (), [durations.evaluation_s(s, len(sizes)) for s in sizes], self._workers
         )
-        fused = [(stages.FUSION, durations.fusion_s(size)) for size in sizes] if len(sizes) > 1 else []
+        alone_s = [durations.threaded_s(durations.fusion_s(s), cores(), processors()) for s in sizes]
+        fused = [(stages.FUSION, seconds) for seconds in alone_s] if len(sizes) > 1 else []
         expected = [
             (stages.EXCHANGE, durations.exchange_s(len(sizes))),
             *fused,

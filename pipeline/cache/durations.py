@@ -27,12 +27,18 @@ INFORMATION_S = 0.020
 """Of a frame, for every million pixels."""
 FUSION_S = (6.0, 200.0)
 """Of a robot that has peers: in any case, and for every million pixels of an image."""
-EVALUATION_S = 0.40
-"""Of a frame of a robot and each robot whose map is drawn there, for every million pixels."""
+SCORED_S, COMPARED_S = 0.35, 0.60
+"""Of a render that is scored, and of a view that is compared with the others, for every million pixels."""
+VIEWS, HELD_OUT = 40, 8
+"""The most views of a set that are scored, and every so many frames one is held out."""
+RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
+"""Maps that are drawn at a held-out view, at a keyframe, and at a view of a peer."""
 EXCHANGE_S = 6.0
 """Of a pair of robots, and of the team."""
 READERS_S = 6.0
 """Report and view."""
+SERIAL = 0.15
+"""Share of a stage of several threads that one thread does."""
 SHARED_CORE = 1.6
 """By how much slower two processes are that share a core."""
 
@@ -94,9 +100,11 @@ def evaluation_s(size: Size, robots: int) -> float:
 
     Args:
         size: of its log.
-        robots: of the team, with itself: their maps are drawn at its views.
+        robots: of the team, with itself; its maps are drawn at the views of the others.
     """
-    return EVALUATION_S * size["pixels"] * 1e-6 * size["frames"] * robots
+    views, keyframes = min(VIEWS, size["frames"] / HELD_OUT), min(VIEWS, size["keyframes"])
+    drawn = RENDERS * views + KEYFRAME_RENDERS * keyframes + (PEER_RENDERS * views if robots > 1 else 0)
+    return size["pixels"] * 1e-6 * (SCORED_S * drawn + COMPARED_S * views)
 
 
 def exchange_s(robots: int) -> float:
@@ -122,6 +130,18 @@ def side_by_side_s(begun: Iterable[float], waiting: Sequence[float], workers: in
     for seconds in waiting:
         heapq.heapreplace(ends, ends[0] + seconds)
     return max(ends, default=0.0)
+
+
+def threaded_s(seconds: float, cores: int, processors: int) -> float:
+    """Time of a stage that uses all processors.
+
+    Args:
+        seconds: that one thread takes.
+        cores: of the machine.
+        processors: of the machine; threads of a core count each.
+    """
+    speed = cores * (2 / SHARED_CORE if processors > cores else 1.0)
+    return seconds * (SERIAL + (1 - SERIAL) / speed)
 
 
 def slowdown(workers: int, cores: int) -> float:
