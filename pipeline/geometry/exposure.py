@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,9 +36,16 @@ class Exposure:
         Args:
             color: RGB [h, w, 3], as taken.
         """
+        # a table of all 256 values: every step of a training converts an image
+        return np.asarray(cv2.LUT(color, self._table), dtype=np.float32)
+
+    @cached_property
+    def _table(self) -> NDArray[np.float32]:
+        """Color [1, 256, 3] of the map by value in the image."""
+        values = np.arange(256)[:, None]
         scale = (1 / (255 * self.gain)).astype(np.float32)
-        shown = color * scale - (self.offset / self.gain).astype(np.float32)
-        return np.where(color >= SATURATED, self.white.astype(np.float32), shown)
+        shown = values.astype(np.float32) * scale - (self.offset / self.gain).astype(np.float32)
+        return np.where(values >= SATURATED, self.white.astype(np.float32), shown)[None]
 
     def in_image(self, color: NDArray[np.floating], alpha: NDArray[np.floating]) -> NDArray[np.float32]:
         """A render of the map, on black, in the colors of the image.
