@@ -135,6 +135,12 @@ def checked_exposure(exposure: tuple[float, float]) -> tuple[float, float]:
     return math.exp(pair[0]), float(pair[1])
 
 
+def check_share(name: str, value: object) -> None:
+    """Refuse what is no number from 0 to 0.5."""
+    if not (isinstance(value, Real) and 0 <= float(value) <= 0.5):
+        raise ValueError(f"{name} is {value!r}, expected a number from 0 to 0.5")
+
+
 def check_array(name: str, array: object, shape: tuple[int, ...], dtype: type) -> None:
     """Refuse what the kernels cannot add to in place."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype:

@@ -129,16 +129,18 @@ def linearized(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
     return J @ W, from_clamp.detach()
 
 
-def paint(pixels: Any, screen: Screen, background: Any) -> Painting:
-    """Color, depth and alpha of pixels [m, 2]."""
-    weights, gates = blend(pixels, screen.centers, screen.conics, screen.opacities)
+def paint(pixels: Any, screen: Screen, background: Any, closing: float = 0.0) -> Painting:
+    """Color, depth and alpha of pixels [m, 2]; `closing`: see `blend`."""
+    weights, gates = blend(pixels, screen.centers, screen.conics, screen.opacities, closing)
     total = weights.sum(-1)
     color = (weights[..., None] * screen.colors).sum(-2) + (1 - total)[:, None] * background
     along_ray = screen.depths + (screen.slopes * (pixels[:, None] - screen.centers)).sum(-1)
     return Painting(color, (weights * along_ray).sum(-1), total, weights, gates, along_ray)
 
 
-def blend(pixels: Any, centers: Any, conics: Any, opacities: Any) -> tuple[Any, tuple[Any, Any]]:
+def blend(
+    pixels: Any, centers: Any, conics: Any, opacities: Any, closing: float = 0.0
+) -> tuple[Any, tuple[Any, Any]]:
     """Blending weights [m, k] of k Gaussians, nearest first, at pixels [m, 2].
 
     Args:
@@ -146,6 +148,8 @@ def blend(pixels: Any, centers: Any, conics: Any, opacities: Any) -> tuple[Any, 
         centers: [k, 2], px.
         conics: [k, 2, 2], 1/px^2.
         opacities: [k].
+        closing: where it is above TRANSMITTANCE_MIN, the Gaussian that takes the product below it stops all that is
+            left, as if its alpha were 1.
     Returns:
         The weights, and the quantities that the thresholds apply to: alpha before its clamp and the light left after
         each Gaussian, [m, k] both.
@@ -157,6 +161,10 @@ def blend(pixels: Any, centers: Any, conics: Any, opacities: Any) -> tuple[Any, 
     raw = opacities * torch.exp(-0.5 * power)
     alpha = torch.where(raw.detach() >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
     left = torch.cumprod(1 - alpha.detach(), dim=1)
+    if closing > TRANSMITTANCE_MIN:
+        before = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], dim=1)
+        alpha = torch.where((before >= closing) & (left < closing), torch.ones_like(alpha), alpha)
+        left = torch.where(before >= closing, torch.ones_like(left), torch.zeros_like(left))  # all before it
     drawn = torch.cumprod((left >= TRANSMITTANCE_MIN).long(), dim=1).bool()
     alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
     before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)[:, :-1]

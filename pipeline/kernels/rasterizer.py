@@ -19,6 +19,7 @@ from duagc.pipeline.kernels.arguments import (
     KernelStatus,
     arrays_of,
     check_array,
+    check_share,
     check_type,
     check_wanted,
     checked_background,
@@ -30,6 +31,7 @@ from duagc.pipeline.kernels.arguments import (
     complaint_about,
     refuse_bad_image,
 )
+from duagc.pipeline.kernels.definition import TRANSMITTANCE_MIN
 from duagc.pipeline.kernels.outputs import NOTHING, empty, gradients_of, outputs_for, zeros
 from duagc.pipeline.kernels.types import (
     FISHER_DIAGONAL_COLUMNS,
@@ -140,6 +142,7 @@ class Rasterizer:
         pose: bool = False,
         parameters: bool = True,
         depth_certainty: Image | None = None,
+        closing: float = 0.0,
     ) -> tuple[ViewLoss, Gradients]:
         """Forward, loss and backward of one view in one pass: `splat.losses.rgbd_loss` and its derivatives.
 
@@ -147,7 +150,7 @@ class Rasterizer:
         over Gaussians of blending weight times the Huber loss of the Gaussian's depth at the pixel minus the measured
         one. The blended depth may be right because what lies in front and behind cancels; this one may not.
 
-        `fisher` and the others may follow as after a `forward`.
+        `fisher` and the others may follow as after a `forward`, but not where `closing` drew another image.
 
         Args:
             gaussians: as in `forward`.
@@ -163,6 +166,8 @@ class Rasterizer:
             pose: also differentiate by the right tangent of T_map_camera.
             parameters: False takes the derivative of the pose alone, which is cheaper.
             depth_certainty: factor [H, W] of the depth residuals, 0..1; None: all 1.
+            closing: the Gaussian that takes the light of a pixel below this stops all that is left: about the same
+                image from fewer Gaussians. At most `TRANSMITTANCE_MIN`: as `forward` draws.
         Returns:
             The loss with its terms, and the derivatives of its value.
         Raises:
@@ -178,7 +183,8 @@ class Rasterizer:
         gain_and_offset = checked_exposure(exposure)
         check_type("loss", loss, LossWeights)
         *of_images, surface_weight = astuple(loss)
-        weights = np.array([*of_images, *gain_and_offset, surface_weight], np.float32)
+        check_share("closing", closing)
+        weights = np.array([*of_images, *gain_and_offset, surface_weight, closing], np.float32)
         check_wanted(pose, parameters, fisher=False)
         out = outputs_for(gaussians, parameters)
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
@@ -189,6 +195,8 @@ class Rasterizer:
         self._gaussians = None
         refuse_bad_image(status, {"color": NOT_FINITE, "depth_m": NEGATIVE, "depth_certainty": NEGATIVE})
         self._finish(gaussians, (height, width), status)
+        if closing > TRANSMITTANCE_MIN:
+            self._gaussians = None
         of_color, of_depth, missing, by_gain, by_offset, surface = (float(value) for value in values)
         value = (
             of_color

@@ -54,7 +54,13 @@ class TrainingStep:
     depth_kind: DepthKind
 
     def gradients(
-        self, gaussians: Gaussians, camera: PinholeCamera, view: TrainingView, *, pose: bool = False
+        self,
+        gaussians: Gaussians,
+        camera: PinholeCamera,
+        view: TrainingView,
+        *,
+        pose: bool = False,
+        closing: float = 0.0,
     ) -> tuple[ViewLoss, Gradients]:
         """Loss of a view and its derivatives by the Gaussians.
 
@@ -63,6 +69,7 @@ class TrainingStep:
             camera: of the view.
             view: an image with its pose.
             pose: also differentiate by the right tangent of the pose.
+            closing: as of `Rasterizer.view_gradients`.
         """
         return self.rasterizer.view_gradients(
             gaussians,
@@ -75,6 +82,7 @@ class TrainingStep:
             depth_kind=self.depth_kind,
             depth_certainty=view.depth_certainty,
             pose=pose,
+            closing=closing,
         )
 
     def __call__(
@@ -86,6 +94,7 @@ class TrainingStep:
         adam: CompiledAdam,
         rates: LearningRates,
         least_log_scales: NDArray[np.float32] | np.float32,
+        closing: float = 0.0,
     ) -> tuple[Gaussians, ViewLoss]:
         """The Gaussians after one step of Adam on one view, and the loss before it.
 
@@ -96,8 +105,9 @@ class TrainingStep:
             adam: state of the optimization; changed.
             rates: step lengths.
             least_log_scales: log of meters, one for all or [n, 3]; no log-scale falls below.
+            closing: as of `Rasterizer.view_gradients`.
         """
-        loss, gradients = self.gradients(gaussians, camera, view)
+        loss, gradients = self.gradients(gaussians, camera, view, closing=closing)
         return self.stepped(
             gaussians, gradients, adam=adam, rates=rates, least_log_scales=least_log_scales
         ), loss

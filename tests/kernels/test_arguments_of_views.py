@@ -156,6 +156,12 @@ def test_exposures_that_cannot_be(exposure):
         differentiated(exposure=exposure)
 
 
+@pytest.mark.parametrize("closing", [-0.1, 0.6, float("nan"), None, "0.1"])
+def test_shares_of_light_that_cannot_be(closing):
+    with pytest.raises(REFUSED, match="closing"):
+        differentiated(closing=closing)
+
+
 @pytest.mark.parametrize("name", ["color_huber", "depth_weight", "depth_huber_m", "alpha_weight"])
 @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, -np.inf, "1", None, 1e30])
 def test_loss_weights_that_cannot_be(name, value):

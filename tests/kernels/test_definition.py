@@ -522,6 +522,34 @@ def test_view_gradients_draw_a_view_that_can_be_asked_further(rasterizer, plain)
     np.testing.assert_array_equal(weights, rasterizer.contributions()[0])
 
 
+@pytest.mark.parametrize("depth", DEPTH_KINDS)
+def test_a_pixel_that_closes_early_is_that_of_the_reference(plain, depth):
+    color, depth_m = measured_images(plain)
+    view = plain.gaussians, plain.camera, plain.T_camera_map
+    options = {"color": color, "depth_m": depth_m, "loss": dataclasses.replace(LOSS, surface_weight=0.8)}
+    options |= {"depth_kind": depth, "pose": True, "mask": checkerboard(plain)}
+    rasterizer = Rasterizer()
+    loss, gradients = rasterizer.view_gradients(*view, **options, closing=0.2)
+    wanted, of_reference = ReferenceRasterizer().view_gradients(*view, **options, closing=0.2)
+    assert loss.value == pytest.approx(wanted.value, rel=1e-5)
+    assert_same_gradients(gradients, of_reference, 1e-4)
+    whole, of_whole = rasterizer.view_gradients(*view, **options)
+    assert abs(loss.value - whole.value) > 1e-4 * whole.value
+    assert np.abs(gradients.means - of_whole.means).max() > 1e-3 * np.abs(of_whole.means).max()
+    same, of_same = rasterizer.view_gradients(*view, **options, closing=1e-4)  # where pixels close anyway
+    assert same == whole
+    np.testing.assert_array_equal(of_same.means, of_whole.means)
+
+
+def test_a_view_that_was_closed_early_cannot_be_asked_further(plain):
+    color, depth_m = measured_images(plain)
+    rasterizer = Rasterizer()
+    view = plain.gaussians, plain.camera, plain.T_camera_map
+    rasterizer.view_gradients(*view, color=color, depth_m=depth_m, loss=LOSS, closing=0.2)
+    with pytest.raises(RuntimeError, match="forward"):
+        rasterizer.contributions()
+
+
 def test_derivatives_by_exposure_are_differences(rasterizer, plain):
     color, depth_m = measured_images(plain)
     step = 1e-3 if not isinstance(rasterizer, ReferenceRasterizer) else 1e-6

@@ -52,19 +52,30 @@ struct OpenBlock {
     OpenBlock(const Block& block, Mask wanted)
         : pixel_x(block.pixels_x()), pixel_y(block.pixels_y()), left(select_or_zero(wanted, Vec(1.0f))), T(1.0f), R(0.0f), G(0.0f), B(0.0f),
           D(0.0f) {}
-    bool open() const { return any(left >= Vec(TRANSMITTANCE_MIN)); }
+    bool open(Vec least) const { return any(left >= least); }
 };
 
 // alpha and weight of a block's items, for a sweep that follows at once.
 struct Memory {
+    static constexpr bool CLOSES = false;
     float *alphas, *weights;
+    float least() const { return TRANSMITTANCE_MIN; }
     void keep(uint32_t item, Vec alpha, Vec weight) const {
         store(alphas + static_cast<size_t>(item) * LANES, alpha);
         store(weights + static_cast<size_t>(item) * LANES, weight);
     }
 };
 struct NoMemory {
+    static constexpr bool CLOSES = false;
+    float least() const { return TRANSMITTANCE_MIN; }
     void keep(uint32_t, Vec, Vec) const {}
+};
+// The same where the Gaussian that takes a pixel below `closing` stops all of its light: it is blended with an alpha of 1.
+struct ClosingMemory : Memory {
+    static constexpr bool CLOSES = true;
+    float closing;
+    ClosingMemory(const Memory& memory, float least) : Memory(memory), closing(least) {}
+    float least() const { return closing; }
 };
 
 // Blends the next N candidates; keeps those that were blended.
@@ -89,11 +100,21 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
     block.left = max(block.left, Vec(1e-8f));  // far from denormal numbers
     unrolled<N>([&](auto k) ALWAYS_INLINE {
         const Splat& s = splats[position[k]];
-        const Vec weight_if_open = alpha[k] * block.left;
-        block.left = block.left * rest[k];
-        const Mask blended = (block.left >= Vec(TRANSMITTANCE_MIN)) & seen[k];
+        const Vec before = block.left, least(memory.least());
+        Vec weight_if_open = alpha[k] * before;
+        block.left = before * rest[k];
+        Mask blended;
+        if constexpr (Kept::CLOSES) {
+            blended = (before >= least) & seen[k];
+            const Mask stays_open = block.left >= least;
+            weight_if_open = select(stays_open, weight_if_open, before);
+            alpha[k] = select(stays_open, alpha[k], Vec(1.0f));
+            block.T = select(blended, select_or_zero(stays_open, block.left), block.T);
+        } else {
+            blended = (block.left >= least) & seen[k];
+            block.T = select(blended, block.left, block.T);
+        }
         const Vec weight = select_or_zero(blended, weight_if_open);
-        block.T = select(blended, block.left, block.T);
         block.R = fma(weight, Vec(s.r), block.R);
         block.G = fma(weight, Vec(s.g), block.G);
         block.B = fma(weight, Vec(s.b), block.B);
@@ -113,10 +134,11 @@ template <DepthKind KIND, class Kept>
 NO_INLINE static uint32_t blend_candidates(const Splat* splats, const TileItems items, uint32_t count, const Kept memory, OpenBlock& result,
                                            uint64_t& evaluated) {
     OpenBlock block = result;
+    const Vec least(memory.least());
     uint32_t kept = 0, i = 0;
-    for (; i + ABREAST <= count && block.open(); i += ABREAST)
+    for (; i + ABREAST <= count && block.open(least); i += ABREAST)
         kept = blend_some<KIND, ABREAST>(splats, items.positions + i, items, kept, memory, block);
-    for (; i < count && block.open(); i++) kept = blend_some<KIND, 1>(splats, items.positions + i, items, kept, memory, block);
+    for (; i < count && block.open(least); i++) kept = blend_some<KIND, 1>(splats, items.positions + i, items, kept, memory, block);
     evaluated += i;
     result = block;
     return kept;

@@ -4,6 +4,7 @@
 // Per pixel, with h the Huber function of slope 1 in its tail: h(e^a color + b - measured color), and where a depth z was
 // measured h(depth - alpha z), 1 - alpha, and the sum over Gaussians of weight h(z_i - z) with z_i the depth of each; every term a
 // mean over its pixels (splat.losses.rgbd_loss, but for the last). Residuals of depth are multiplied by the pixel's certainty.
+// With loss.closing the Gaussian that takes a pixel's light below it stops all that is left: fewer pairs, about the same image.
 #pragma once
 
 #include "parameters.h"
@@ -130,7 +131,10 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         if (block.outside(view)) continue;
         const Mask wanted = mask_of_bits(block.wanted(view));
         TileItems next = sweep.items;
-        const OpenBlock image = blend_block<KIND>(frame, sweep.tile, sweep.splats, b, block, wanted, memory, next, evaluated);
+        const OpenBlock image =
+            loss.closing > TRANSMITTANCE_MIN
+                ? blend_block<KIND>(frame, sweep.tile, sweep.splats, b, block, wanted, ClosingMemory(memory, loss.closing), next, evaluated)
+                : blend_block<KIND>(frame, sweep.tile, sweep.splats, b, block, wanted, memory, next, evaluated);
         const Vec rgb[3] = {fma(image.T, background[0], image.R), fma(image.T, background[1], image.G),
                             fma(image.T, background[2], image.B)};
         const Cotangents v = loss_of_block(image, rgb, measured[b], wanted, loss, scales, sums);

@@ -200,6 +200,7 @@ struct Loss {
     const float* certainty;  // factor of the residuals of depth, per pixel; null: 1
     float color_huber, depth_weight, depth_huber_m, alpha_weight, surface_weight;
     float gain, offset;  // of the exposure: the image is about gain * rendered + offset
+    float closing;       // light below which a pixel closes early; 0: as images are drawn
 };
 constexpr int LOSS_SUMS = 6;  // color, depth, missing alpha, derivatives by ln gain and by offset, surface
 struct LossValues {

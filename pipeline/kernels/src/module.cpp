@@ -123,7 +123,7 @@ public:
         const Use use(busy_);
         look(pose, intrinsics, background, mask, ray_plane, width, height, threads);
         const float* w = weights.data();
-        const Loss loss = {color.data(), depth_m.data(), certainty.is_valid() ? data_or_null(certainty) : nullptr, w[0], w[1], w[2], w[3], w[6], w[4], w[5]};
+        const Loss loss = {color.data(), depth_m.data(), certainty.is_valid() ? data_or_null(certainty) : nullptr, w[0], w[1], w[2], w[3], w[6], w[4], w[5], w[7]};
         const GradientArrays out = {data_or_null(g_means),  data_or_null(g_quats), data_or_null(g_log_scales), data_or_null(g_colors),
                                     data_or_null(g_logits), nullptr,               data_or_null(g_pose)};
         const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
