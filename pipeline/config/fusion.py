@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
-from duagc.pipeline.config.training import LearningRates, MapLossConfig
+from duagc.pipeline.config.training import LearningRates, MapLossConfig, SparseStepsConfig
 
 
 class FinetuneConfig(Config):
@@ -25,6 +25,7 @@ class FinetuneConfig(Config):
     """First learning rates as a share of the mapper's."""
     rate_decay: float = Field(default=0.1, gt=0.0, le=1.0)
     """They fall to this share: slowly, fast, slowly."""
+    sparse: SparseStepsConfig = SparseStepsConfig()
     rates: LearningRates = LearningRates()
     loss: MapLossConfig = MapLossConfig()
 

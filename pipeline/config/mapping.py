@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
-from duagc.pipeline.config.training import DepthKind, LearningRates, MapLossConfig
+from duagc.pipeline.config.training import DepthKind, LearningRates, MapLossConfig, SparseStepsConfig
 
 THICKNESS_FLOOR_M = 1e-3
 """Thickness below which no splat differs from a plane: log-scales stop here, and have no information there."""
@@ -79,6 +79,8 @@ class MappingConfig(Config):
     rates: LearningRates = LearningRates()
     final_rate_decay: float = 0.03
     """The final optimization's learning rates fall to this share: slowly, fast, slowly."""
+    sparse: SparseStepsConfig = SparseStepsConfig()
+    """Of the final optimization."""
     stable_steps: int = 0
     """Steps after which a Gaussian is stable: frozen until the final optimization; 0: never."""
     depth: DepthKind | Literal["auto"] = "auto"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
+from pydantic import Field
+
 from duagc.pipeline.config.base import Config
 
 DepthKind: TypeAlias = Literal["blended", "ray_plane"]
@@ -49,6 +51,17 @@ class MapLossConfig(Config):
     def of(self, depth: DepthKind) -> LossConfig:
         """The loss of maps of a kind."""
         return self.ray_plane if depth == "ray_plane" else self.blended
+
+
+class SparseStepsConfig(Config):
+    """What the steps of a training leave out until it nears its end."""
+
+    until: float = Field(default=0.75, ge=0.0, le=1.0)
+    """Share of the steps that leave something out; the others look at whole images, blended as they are drawn."""
+    checkerboard: bool = True
+    """Look at every second block of 4x4 pixels, and at the others when the view comes again."""
+    closing: float = Field(default=0.005, ge=0.0, le=0.5)
+    """The Gaussian that takes the light at a pixel below this share stops all that is left; 0: blend to the end."""
 
 
 class LearningRates(Config):

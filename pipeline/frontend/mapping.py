@@ -20,6 +20,7 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
+from duagc.pipeline.frontend.contributions import contributions
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
 from duagc.pipeline.frontend.view_poses import PoseStep, PoseSteps
@@ -28,13 +29,13 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.kernels import (
-    FisherSums,
     Gradients,
     LossWeights,
     Rasterizer,
     Render,
     ViewLoss,
 )
+from duagc.pipeline.kernels.sparse_steps import EVERYTHING, LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import TrainingStep
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import smoothstep_decay
@@ -179,13 +180,12 @@ class Mapper:
         inserted, pruned = self._seed(
             view, self.config.first_share if keyframe_index == 0 else self.config.keyframe_share
         )
-        before = self._loss(view, self.config.iterations_level)
-        for other in optimization_window(
-            self._views, view, self.config, camera=self.cameras[0], seed=self.seed
-        ):
-            self._optimize(other, self.config.iterations_level, self.config.rates)
+        level = self.config.iterations_level
+        window = optimization_window(self._views, view, self.config, camera=self.cameras[0], seed=self.seed)
+        losses = [self._optimize(other, level, self.config.rates) for other in window]
+        before = losses[0] if losses else self._loss(view, level)  # the newest keyframe comes first
         pruned += self._map.prune_degenerate()
-        after = self._loss(view, self.config.iterations_level)
+        after = self._loss(view, level)
         return MappingStats(inserted, pruned, len(self._map), before, after)
 
     def add_view(
@@ -250,6 +250,7 @@ class Mapper:
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._map.adam.freeze_after(None)
         poses = PoseSteps([view.information for view in views])
+        sparse = SparseSteps(config.sparse, self.cameras[0], steps)
         refined = config.pose_rate > 0 and not self.exact_depth  # where depth is exact, so are the poses
         if found is not None:
             poses.go_on(found[1])
@@ -262,14 +263,16 @@ class Mapper:
                     len(views)
                 )
             if step in rounds:
-                added, removed = self._densify(1.0 / (len(rounds) - rounds.index(step)))
-                inserted, pruned = inserted + added, pruned + removed
+                number = rounds.index(step)
+                pruned += self._prune_useless(views[number % 2 :: 2], len(views))
+                inserted += self._densify(1.0 / (len(rounds) - number))
             elif step == steps // 2:
-                pruned += self._map.keep(self._contributions(views)[0] >= config.min_contribution)
+                pruned += self._prune_useless(views, len(views))
             share = smoothstep_decay(step, steps, config.final_rate_decay)
             chosen = int(order[position])
             pose_step = poses.of(chosen, config.pose_rate * share) if refined and chosen else None
-            self._optimize(views[chosen], 0, config.rates.times(share), pose_step=pose_step)
+            looked_at = sparse.at(step, visit=step // len(views) + chosen)
+            self._optimize(views[chosen], 0, config.rates.times(share), looked_at, pose_step=pose_step)
             state = partial(self._optimized, (before, inserted, pruned), poses)
             checkpoints.at(part, step + 1, steps, state, shown=lambda: self.gaussians)
         pruned += self._map.prune_degenerate()
@@ -281,14 +284,9 @@ class Mapper:
 
     # --- one view -----------------------------------------------------------------------------------------------
 
-    def _draw(self, view: View, level: int, mask: NDArray[np.bool_] | None = None) -> Render:
-        return self.rasterizer.forward(
-            self._map.gaussians,
-            self.cameras[level],
-            se3.inverse(view.T_map_camera),
-            mask=mask,
-            depth_kind=self.depth,
-        )
+    def _draw(self, view: View) -> Render:
+        T_camera_map = se3.inverse(view.T_map_camera)
+        return self.rasterizer.forward(self.gaussians, self.cameras[0], T_camera_map, depth_kind=self.depth)
 
     def _loss(self, view: View, level: int) -> float:
         return self._view_gradients(view, level)[0].value
@@ -300,11 +298,21 @@ class Mapper:
         return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
 
     def _optimize(
-        self, view: View, level: int, rates: LearningRates, *, pose_step: PoseStep | None = None
-    ) -> None:
-        """One Adam step of all Gaussians in one view, and of its pose where a step of it is given."""
-        _, gradients = self._step.gradients(
-            self._map.gaussians, self.cameras[level], view.training(level), pose=pose_step is not None
+        self,
+        view: View,
+        level: int,
+        rates: LearningRates,
+        looked_at: LookedAt = EVERYTHING,
+        *,
+        pose_step: PoseStep | None = None,
+    ) -> float:
+        """One Adam step of all Gaussians in one view, and of its pose where a step of it is given; the loss before."""
+        loss, gradients = self._step.gradients(
+            self._map.gaussians,
+            self.cameras[level],
+            looked_at.of(view.training(level)),
+            pose=pose_step is not None,
+            closing=looked_at.closing,
         )
         self._map.gaussians = self._step.stepped(
             self._map.gaussians,
@@ -316,6 +324,7 @@ class Mapper:
         if pose_step is not None:
             assert gradients.pose is not None  # it was asked for
             view.T_map_camera = view.T_map_camera @ se3.exp(pose_step(gradients.pose))
+        return loss.value
 
     # --- what is in the map -------------------------------------------------------------------------------------
 
@@ -326,7 +335,7 @@ class Mapper:
         color, depth_m = view.images(0)
         wanted = depth_m > 0  # zero where the mask forbids a pixel
         if len(self._map):
-            render = self._draw(view, 0)
+            render = self._draw(view)
             color = self._as_drawn(view, color, render)
             wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=view.depth_sigma_m)
         new = self._discs(view, color, depth_m, wanted, budget=budget)
@@ -366,7 +375,7 @@ class Mapper:
             return 0, 0
         inserted = 0
         for view in self._support:
-            render = self._draw(view, 0)
+            render = self._draw(view)
             color, depth_m = view.images(0)
             thin = (depth_m > 0) & (render.alpha < config.seeding.min_alpha)
             new = self._discs(
@@ -374,22 +383,32 @@ class Mapper:
             )
             self._map.append(new)
             inserted += len(new)
+        excess = len(self._map) - config.max_gaussians
+        if excess <= 0:
+            return inserted, 0
         self._map.contribution = self._contributions([*self._views, *self._support])[0]
-        return inserted, self._map.prune_least(max(0, len(self._map) - config.max_gaussians))
+        return inserted, self._map.prune_least(excess)
 
-    def _densify(self, share: float) -> tuple[int, int]:
-        """Replace what contributes nothing by discs where keyframes are drawn worst; numbers inserted and pruned.
+    def _prune_useless(self, looked_at: Sequence[View], views: int) -> int:
+        """Remove what contributes nothing to the views that are looked at, of so many; how many there were.
+
+        What none of these views sees stays.
+        """
+        found, seen = self._contributions(looked_at)
+        least = self.config.min_contribution * len(looked_at) / views
+        return self._map.keep((found >= least) | (~seen & (len(looked_at) < views)))
+
+    def _densify(self, share: float) -> int:
+        """Insert discs where keyframes are drawn worst; how many.
 
         `share` of the room below the cap is used. Every keyframe gets an equal part of it, in turn, and sees what
         those before it inserted; no more than an eighth of its finest cells is seeded.
         """
-        everything = [*self._views, *self._support]
-        pruned = self._map.keep(self._contributions(everything)[0] >= self.config.min_contribution)
         room = int(share * (self.config.max_gaussians - len(self._map)))
         inserted = 0
         for k, view in enumerate(self._views):
             budget = room * (k + 1) // len(self._views) - room * k // len(self._views)
-            render = self._draw(view, 0)
+            render = self._draw(view)
             color, depth_m = view.images(0)
             color = self._as_drawn(view, color, render)
             budget = min(budget, depth_m.size // (8 * self.config.seeding.cell_sizes_px[-1] ** 2))
@@ -397,25 +416,10 @@ class Mapper:
             new = self._discs(view, color, depth_m, wanted, budget=budget)
             self._map.append(new)
             inserted += len(new)
-        return inserted, pruned
+        return inserted
 
     def _contributions(self, views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Squared change of these views' images, in units of the noise, if a Gaussian was removed; and if any saw it.
-
-        A pixel is linear in each Gaussian's blending factor, and the derivative by the opacity logit is that
-        factor's derivative times (1 - opacity), so the Gauss-Newton information of the logit divided by
-        (1 - opacity)^2 is exactly the sum of squared changes.
-        """
-        sums = FisherSums(len(self._map))
-        camera = self.cameras[1]
-        inverse_color = np.full(
-            (camera.height, camera.width), self.config.contribution_color_sigma**-2, np.float32
+        """What these views would lack of each Gaussian; and if any saw it (`contributions`)."""
+        return contributions(
+            self.gaussians, views, self.rasterizer, self.config, camera=self.cameras[1], depth=self.depth
         )
-        for view in views:
-            self._draw(view, 1, view.half_mask)
-            inverse_depth = (view.half_depth_m > 0) * np.float32(self.config.contribution_depth_sigma_m**-2)
-            if view.half_certainty is not None:
-                inverse_depth = inverse_depth * view.half_certainty**2
-            self.rasterizer.fisher(inverse_color, inverse_depth, sums)
-        transparency = 1.0 / (1.0 + np.exp(self._map.gaussians.opacity_logits.astype(np.float64)))
-        return sums.opacity / transparency**2, sums.observations > 0

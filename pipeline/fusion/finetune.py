@@ -25,6 +25,7 @@ from duagc.pipeline.config.fusion import FinetuneConfig
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
+from duagc.pipeline.kernels.sparse_steps import SparseSteps
 from duagc.pipeline.kernels.training import TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.losses import depth_certainty
@@ -86,23 +87,26 @@ def finetune_map(
     # the streams keep the names that they had: under other names they would draw other views
     own = _in_turn(views, context.seed, "fusion.refine")
     peer = _in_turn(peer_views, context.seed, "fusion.refine.peers")
+    sparse = SparseSteps(config.sparse, context.camera, total)
     first = 0
     if (saved := checkpoints.resume(PART)) is not None:
         first, (gaussians, state) = saved
         adam.go_on(state)
     for step in range(total):
         of_peer = step < head and (step + 1) * peer_steps // head > step * peer_steps // head
-        view = next(peer if of_peer else own)
+        view, visit = next(peer if of_peer else own)
         if step < first:
             continue  # its view was taken by the process before
         share = config.rate * smoothstep_decay(step, total, config.rate_decay)
+        looked_at = sparse.at(step, visit)
         stepped, _ = take_step(
             gaussians,
             context.camera,
-            _training_view(view, weights.depth_huber_m),
+            looked_at.of(_training_view(view, weights.depth_huber_m)),
             adam=adam,
             rates=config.rates.times(share),
             least_log_scales=floor,
+            closing=looked_at.closing,
         )
         gaussians = stepped if trained is None else _where(trained, stepped, gaussians)
         checkpoints.at(PART, step + 1, total, partial(_state, gaussians, adam))
@@ -119,11 +123,12 @@ def _training_view(view: PosedRgbd, huber_m: float) -> TrainingView:
     return TrainingView(view.unit_color, view.depth_m, view.T_world_camera, view.mask, certainty)
 
 
-def _in_turn(views: Sequence[PosedRgbd], seed: int, stream: str) -> Iterator[PosedRgbd]:
-    """The views without end, in random order, each once before any comes again."""
-    for start in itertools.count(step=max(1, len(views))):
+def _in_turn(views: Sequence[PosedRgbd], seed: int, stream: str) -> Iterator[tuple[PosedRgbd, int]]:
+    """The views without end, in random order, each once before any comes again; and the number of the visit."""
+    for visit in itertools.count():
+        start = visit * max(1, len(views))
         for k in random_streams.generator(seed, stream, start=start).permutation(len(views)):
-            yield views[k]
+            yield views[k], visit + int(k)
 
 
 def _where(chosen: NDArray[np.bool_], a: Gaussians, b: Gaussians) -> Gaussians:

@@ -1,0 +1,84 @@
+"""Training steps that leave out what costs more than it brings, until the training nears its end.
+
+Half of the 4x4 blocks of an image, in a checkerboard, tell nearly as much as all of them. And where hardly any light is
+left at a pixel, the Gaussians that share it say little; the one that takes the light below a limit stops it all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.training import SparseStepsConfig
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels.training import TrainingView
+
+BLOCK_PX = 4
+"""Side of a block, as the kernels list them."""
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """What a step looks at.
+
+    Attributes:
+        pixels: bool [H, W]; None: all.
+        closing: of `Rasterizer.view_gradients`.
+    """
+
+    pixels: NDArray[np.bool_] | None = None
+    closing: float = 0.0
+
+    def of(self, view: TrainingView) -> TrainingView:
+        """A view with these pixels alone.
+
+        Args:
+            view: the whole.
+        """
+        if self.pixels is None:
+            return view
+        return replace(view, mask=self.pixels if view.mask is None else self.pixels & view.mask)
+
+
+EVERYTHING = LookedAt()
+
+
+class SparseSteps:
+    """What each step of a training looks at."""
+
+    def __init__(self, config: SparseStepsConfig, camera: PinholeCamera, steps: int) -> None:
+        """Set up.
+
+        Args:
+            config: what is left out, and until when.
+            camera: of the views.
+            steps: of the training, in all.
+        """
+        self._config = config
+        self._until = round(config.until * steps)
+        self._boards = checkerboards(camera.height, camera.width)
+
+    def at(self, step: int, visit: int) -> LookedAt:
+        """What a step looks at.
+
+        Args:
+            step: from 0.
+            visit: number that differs by one from one look at a view to the next, which sees the other half.
+        """
+        if step >= self._until:
+            return EVERYTHING
+        return LookedAt(self._boards[visit % 2] if self._config.checkerboard else None, self._config.closing)
+
+
+def checkerboards(height: int, width: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The black and the white blocks of an image, bool [height, width] both.
+
+    Args:
+        height: pixels.
+        width: pixels.
+    """
+    row, column = np.arange(height) // BLOCK_PX, np.arange(width) // BLOCK_PX
+    black = (row[:, None] + column) % 2 == 0
+    return black, ~black
