@@ -115,6 +115,14 @@ class Checkpoints:
         """Wall and processor time of the processes whose work goes on here."""
         return self._before
 
+    def say(self, line: str) -> None:
+        """Say something about the computation.
+
+        Args:
+            line: without its end.
+        """
+        self._say(line)
+
     def resume(self, name: str) -> tuple[int, Any] | None:
         """Where a part was: steps done, and its state; None: it begins.
 

@@ -66,6 +66,11 @@ class MappingConfig(Config):
     """The same for every view, keyframe or supporting frame; the larger number of steps counts."""
     final_iterations_max: int = 6000
     """Most steps of the final optimization in all."""
+    keyframe_megapixels_s: float | None = Field(default=None, ge=0.0)
+    """Most megapixels that the steps at keyframes look at, per second of log since the keyframe before; None: any."""
+    final_megapixels_s: float | None = Field(default=None, ge=0.0)
+    """Most megapixels that the final optimization looks at, per second of log; None: any. Budgets count pixels, not
+    time: no clock changes a result. What they leave out is said."""
     support_views: int = 40
     """Most tracked frames between keyframes that take part in the final optimization; 0: keyframes only."""
     pose_rate: float = Field(default=0.25, ge=0.0)

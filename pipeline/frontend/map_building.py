@@ -7,6 +7,7 @@ final optimization; the others are registered to the finished map where depth is
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -87,7 +88,14 @@ class MapBuilder:
         for frame in supporting:
             self._support(frame, keyframes[frame.keyframe_index])
         part = f"{self.name}.final"
-        stats, state = save.done(part, lambda: (self._mapper.finalize(save, part), self._mapper.state()))
+        log_s = 1e-9 * (frames[-1].stamp_ns - frames[0].stamp_ns)
+        wanted, steps = self._mapper.budget.final_steps(
+            len(keyframes), len(keyframes) + len(supporting), log_s
+        )
+        self._left_out(wanted - steps, wanted, "of the final optimization", "final_megapixels_s")
+        stats, state = save.done(
+            part, lambda: (self._mapper.finalize(save, part, log_s=log_s), self._mapper.state())
+        )
         self._mapper.go_on(state)
         updates.append(self._update(keyframes[-1], stats))
         clock.lap("final_refinement_s")
@@ -110,8 +118,12 @@ class MapBuilder:
             done, (updates, state) = saved
         self._restore(keyframes[:done], state)
         left = keyframes[done:]
+        steps = self._mapper.budget.keyframe_steps([keyframe.stamp_ns for keyframe in keyframes])
+        wanted = self.config.mapping.iterations * len(keyframes)
+        self._left_out(wanted - sum(steps), wanted, "at keyframes", "keyframe_megapixels_s")
         for keyframe in progress_bar.track(left, f"mapping {self.name}") if self._progress else left:
-            stats = self._with_images(self._mapper.add_keyframe, keyframe)
+            add = partial(self._mapper.add_keyframe, iterations=steps[keyframe.keyframe_index])
+            stats = self._with_images(add, keyframe)
             updates.append(self._update(keyframe, stats))
             self._checkpoints.at(
                 part,
@@ -121,6 +133,14 @@ class MapBuilder:
                 shown=lambda: self._mapper.gaussians,
             )
         return updates, self._mapper.state()
+
+    def _left_out(self, steps: int, wanted: int, which: str, setting: str) -> None:
+        """Say what a budget leaves out."""
+        if steps:
+            self._checkpoints.say(
+                f"warning: {self.name}: {steps} of {wanted} training steps {which} are left out "
+                f"by frontend.mapping.{setting}"
+            )
 
     def _restore(self, keyframes: Sequence[Keyframe], state: Any) -> None:
         """Bring the mapper to a state, with images of the log."""

@@ -8,6 +8,7 @@ threads. See docs/explanation/mapping.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +23,7 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.frontend.contributions import contributions
 from duagc.pipeline.frontend.growing_map import GrowingMap
+from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
 from duagc.pipeline.frontend.view_poses import PoseStep, PoseSteps
 from duagc.pipeline.frontend.view_selection import covisible, optimization_window
@@ -86,6 +88,7 @@ class Mapper:
         """
         self.config, self.seed = config, seed
         self.cameras = (camera, camera.halved())
+        self.budget = MappingBudget(config, camera)
         self.rasterizer = Rasterizer(threads=threads)
         self.depth = config.depth_kind(depth_noise_m)
         self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())
@@ -149,6 +152,7 @@ class Mapper:
         depth_sigma_m: Image | None = None,
         exposure: Exposure | None = None,
         information: NDArray[np.float64] | None = None,
+        iterations: int | None = None,
     ) -> MappingStats:
         """Seed what the map does not explain of a new keyframe and optimize the window around it.
 
@@ -161,6 +165,7 @@ class Mapper:
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
             exposure: of the image; None: as the map.
             information: [6, 6] of the pose; None: nothing is known of it.
+            iterations: most optimization steps; None: those of the configuration.
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
@@ -182,7 +187,7 @@ class Mapper:
         )
         level = self.config.iterations_level
         window = optimization_window(self._views, view, self.config, camera=self.cameras[0], seed=self.seed)
-        losses = [self._optimize(other, level, self.config.rates) for other in window]
+        losses = [self._optimize(other, level, self.config.rates) for other in window[:iterations]]
         before = losses[0] if losses else self._loss(view, level)  # the newest keyframe comes first
         pruned += self._map.prune_degenerate()
         after = self._loss(view, level)
@@ -228,7 +233,9 @@ class Mapper:
         )
         self._support.append(view)
 
-    def finalize(self, checkpoints: Checkpoints = NO_CHECKPOINTS, part: str = "final") -> MappingStats:
+    def finalize(
+        self, checkpoints: Checkpoints = NO_CHECKPOINTS, part: str = "final", *, log_s: float = math.inf
+    ) -> MappingStats:
         """Optimize geometry, color and, where depth is not exact, poses over all views at full size.
 
         The views come in random order, each once before any comes again. In the first half, what contributes
@@ -237,6 +244,7 @@ class Mapper:
         Args:
             checkpoints: of the stage.
             part: its name there.
+            log_s: time that the log took to record, for the budget.
 
         Returns:
             Counts of the whole optimization, losses as means over all keyframes at full size.
@@ -245,8 +253,7 @@ class Mapper:
         views = [*self._views, *self._support]
         first, found = checkpoints.resume(part) or (0, None)
         before, inserted, pruned = (self._mean_loss(), *self._cover()) if found is None else found[0]
-        wanted = max(config.final_iterations * len(self._views), config.final_iterations_view * len(views))
-        steps = min(wanted, config.final_iterations_max)
+        _, steps = self.budget.final_steps(len(self._views), len(views), log_s)
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._map.adam.freeze_after(None)
         poses = PoseSteps([view.information for view in views])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig
 from duagc.pipeline.config.mapping import MappingConfig
@@ -14,6 +15,7 @@ from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.frontend.map_building import supporting_frames
+from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.frontend.output import LATENCY_NS
 from duagc.pipeline.frontend.stage import depth_noise_m, run_frontend
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
@@ -143,6 +145,39 @@ def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
     assert len(common) > 50  # the refinement replaces some and moves the others
     colors = [m.gaussians.colors[np.isin(m.gaussians.ids, common)] for m in (unrefined, final[0])]
     assert not np.array_equal(*colors)
+
+
+def test_a_budget_that_is_too_small_is_said(sensor_log: Path) -> None:
+    megapixels = 1e-6 * CAMERA.width * CAMERA.height
+    mapping = MappingConfig(
+        max_gaussians=300,
+        iterations=6,
+        final_iterations=4,
+        final_iterations_view=0,
+        keyframe_megapixels_s=15 * megapixels,  # some steps, not all, at keyframes a few frames apart
+        final_megapixels_s=2 / (1e-9 * (FRAMES - 1) * FRAME_NS) * megapixels,
+    )
+    config = TRACKING.model_copy(
+        update={
+            "mapping_enabled": True,
+            "mapping": mapping,
+            "keyframes": KeyframeConfig(max_translation_of_depth=0.04),
+        }
+    )
+    said: list[str] = []
+    out = sensor_log.with_name("budget.mcap")
+    run_frontend(sensor_log, out, config, checkpoints=Checkpoints(say=said.append))
+    stamps_ns = [m.stamp_ns for m in messages(out, topics.KEYFRAME)]
+    assert len(stamps_ns) > 2
+    steps = MappingBudget(mapping, CAMERA).keyframe_steps(stamps_ns)
+    assert steps[0] == 6
+    wanted, final = 6 * len(stamps_ns), 4 * len(stamps_ns)
+    assert [line for line in said if line.startswith("warning")] == [
+        f"warning: alpha: {wanted - sum(steps)} of {wanted} training steps at keyframes are left out "
+        "by frontend.mapping.keyframe_megapixels_s",
+        f"warning: alpha: {final - 3} of {final} training steps of the final optimization are left out "
+        "by frontend.mapping.final_megapixels_s",
+    ]
 
 
 def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> None:

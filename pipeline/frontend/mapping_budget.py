@@ -1,0 +1,54 @@
+"""How many training steps a map may take: counted in the pixels that they look at, so that no clock decides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+
+@dataclass(frozen=True)
+class MappingBudget:
+    """Steps by the time that a log took to record.
+
+    Attributes:
+        config: of the mapping.
+        camera: of all views.
+    """
+
+    config: MappingConfig
+    camera: PinholeCamera
+
+    def keyframe_steps(self, stamps_ns: Sequence[int]) -> list[int]:
+        """Steps at each keyframe, by the time since the one before; at the first one all.
+
+        Args:
+            stamps_ns: of the keyframes.
+        """
+        most, camera = self.config.iterations, self.camera
+        limit = self.config.keyframe_megapixels_s
+        if limit is None:
+            return [most] * len(stamps_ns)
+        pixels = camera.width * camera.height / 4**self.config.iterations_level
+        since_s = [1e-9 * (b - a) for a, b in pairwise(stamps_ns)]
+        return [most, *(min(most, int(1e6 * limit * s / pixels)) for s in since_s)][: len(stamps_ns)]
+
+    def final_steps(self, keyframes: int, views: int, log_s: float) -> tuple[int, int]:
+        """Steps of the final optimization: as many as wanted, and as many as the budget allows of them.
+
+        Args:
+            keyframes: how many there are.
+            views: how many there are, keyframes too.
+            log_s: time that the log took to record.
+        """
+        config, sparse = self.config, self.config.sparse
+        wanted = max(config.final_iterations * keyframes, config.final_iterations_view * views)
+        wanted = min(wanted, config.final_iterations_max)
+        if config.final_megapixels_s is None:
+            return wanted, wanted
+        seen = 1 - 0.5 * sparse.until if sparse.checkerboard else 1.0
+        pixels = seen * self.camera.width * self.camera.height
+        return wanted, int(min(wanted, 1e6 * config.final_megapixels_s * log_s / pixels))

@@ -1,0 +1,39 @@
+"""Steps that a budget of pixels per second of log allows."""
+
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import SparseStepsConfig
+from duagc.pipeline.frontend.mapping_budget import MappingBudget
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+CAMERA = PinholeCamera(1000, 500, 400.0, 400.0, 500.0, 250.0)  # half a megapixel
+STAMPS_NS = [0, 1_000_000_000, 5_000_000_000]
+
+
+def budget(**settings: object) -> MappingBudget:
+    return MappingBudget(MappingConfig.model_validate({"iterations": 10, **settings}), CAMERA)
+
+
+def test_without_a_budget_all_steps_are_taken() -> None:
+    assert budget().keyframe_steps(STAMPS_NS) == [10, 10, 10]
+    assert budget().final_steps(2, 10, 1.0) == (220, 220)
+    assert budget(final_iterations_max=100).final_steps(2, 10, 1.0) == (100, 100)
+    assert budget().keyframe_steps([]) == []
+
+
+def test_steps_at_keyframes_by_the_time_since_the_last() -> None:
+    assert budget(keyframe_megapixels_s=2.0).keyframe_steps(STAMPS_NS) == [10, 4, 10]
+    assert budget(keyframe_megapixels_s=2.0, iterations_level=1, iterations=24).keyframe_steps(STAMPS_NS) == [
+        24,
+        16,
+        24,
+    ]
+    assert budget(keyframe_megapixels_s=0.0).keyframe_steps(STAMPS_NS) == [10, 0, 0]
+
+
+def test_final_steps_by_the_length_of_the_log() -> None:
+    whole = SparseStepsConfig(checkerboard=False)
+    assert budget(final_megapixels_s=10.0, sparse=whole).final_steps(2, 10, 5.0) == (220, 100)
+    half = SparseStepsConfig(until=1.0)
+    assert budget(final_megapixels_s=10.0, sparse=half).final_steps(2, 10, 5.0) == (220, 200)
+    assert budget(final_megapixels_s=10.0, sparse=half).final_steps(2, 10, 50.0) == (220, 220)
+    assert budget(final_megapixels_s=0.0).final_steps(2, 10, 5.0) == (220, 0)
