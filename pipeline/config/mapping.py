@@ -85,7 +85,7 @@ class MappingConfig(Config):
     final_rate_decay: float = 0.03
     """The final optimization's learning rates fall to this share: slowly, fast, slowly."""
     sparse: SparseStepsConfig = SparseStepsConfig()
-    """Of the final optimization."""
+    """Of the steps at a keyframe, and of the final optimization."""
     stable_steps: int = 0
     """Steps after which a Gaussian is stable: frozen until the final optimization; 0: never."""
     depth: DepthKind | Literal["auto"] = "auto"

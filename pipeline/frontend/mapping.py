@@ -9,6 +9,7 @@ threads. See docs/explanation/mapping.md.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -52,8 +53,8 @@ class MappingStats:
         inserted: number of Gaussians.
         pruned: number of Gaussians.
         total: number of Gaussians afterwards.
-        loss_before: of the keyframe's own view, before the optimization.
-        loss_after: the same afterwards.
+        loss_before: of the keyframe's own view, at the pixels of its first step.
+        loss_after: of the whole view, after the last one.
     """
 
     inserted: int
@@ -187,7 +188,12 @@ class Mapper:
         )
         level = self.config.iterations_level
         window = optimization_window(self._views, view, self.config, camera=self.cameras[0], seed=self.seed)
-        losses = [self._optimize(other, level, self.config.rates) for other in window[:iterations]]
+        sparse = SparseSteps(self.config.sparse, self.cameras[level], len(window[:iterations]))
+        losses, visits = [], Counter[int]()
+        for step, other in enumerate(window[:iterations]):
+            looked_at = sparse.at(step, visits[other.index])
+            visits[other.index] += 1
+            losses.append(self._optimize(other, level, self.config.rates, looked_at))
         before = losses[0] if losses else self._loss(view, level)  # the newest keyframe comes first
         pruned += self._map.prune_degenerate()
         after = self._loss(view, level)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.mapping import MappingConfig
-from duagc.pipeline.config.training import DepthKind, MapLossConfig, SurfaceLossConfig
+from duagc.pipeline.config.training import DepthKind, MapLossConfig, SparseStepsConfig, SurfaceLossConfig
 from duagc.pipeline.evaluation.image_metrics import depth_error, psnr
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 from duagc.pipeline.frontend.mapping_views import View, view_overlap
@@ -224,6 +224,7 @@ def test_what_was_seen_elsewhere_is_not_given_up_for_what_is_seen_now() -> None:
     covered = []
     for sweep in (2, 7):
         crowded = {"max_gaussians": 100, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
+        crowded |= {"sparse": SparseStepsConfig(until=0.0)}
         mapper = Mapper(CAMERA, QUICK.model_copy(update=crowded), seed=0)
         stats = [mapper.add_keyframe(k, *shot(pose), pose) for k, pose in enumerate(turns)]
         assert sum(s.pruned for s in stats) > 50
