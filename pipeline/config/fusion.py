@@ -11,7 +11,7 @@ from duagc.pipeline.config.training import LearningRates, MapLossConfig, SparseS
 class FinetuneConfig(Config):
     """Finetuning of the fused map on the robot's own images and on renders of its peers' maps."""
 
-    steps_per_view: int = Field(default=9, ge=0)
+    steps_per_view: int = Field(default=8, ge=0)
     """Steps for each own view; 0: the fused map stays as fusion left it."""
     steps_max: int = Field(default=600, ge=0)
     """Most steps on own views."""
@@ -21,7 +21,7 @@ class FinetuneConfig(Config):
     """Most views of peers' maps."""
     support_views: int = Field(default=40, ge=0)
     """Most tracked frames between keyframes that take part."""
-    rate: float = Field(default=0.15, gt=0.0)
+    rate: float = Field(default=0.25, gt=0.0)
     """First learning rates as a share of the mapper's."""
     rate_decay: float = Field(default=0.1, gt=0.0, le=1.0)
     """They fall to this share: slowly, fast, slowly."""
