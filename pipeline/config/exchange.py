@@ -9,6 +9,8 @@ from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig,
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
 from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
 
+EvidenceOrder = Literal["gain", "paper", "random", "reversed"]
+
 
 class PlacesConfig(Config):
     """Place descriptors and candidates for loop closures."""
@@ -89,8 +91,9 @@ class ExchangeConfig(Config):
     weights: WeightKind = "block"
     """Weight of a robot's Gaussian: its information, or one of the simpler kinds to compare with
     (`docs/explanation/information.md`)."""
-    evidence_order: Literal["gain", "paper"] = "gain"
-    """Which Gaussians go first: those that promise the receiver most information per byte, or by the paper's (4)."""
+    evidence_order: EvidenceOrder = "gain"
+    """Which Gaussians go first: those that promise the receiver most information per byte, or by the paper's (4); to
+    compare with, a random order, and the reversed one of `gain`."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
     link: LinkConfig = LinkConfig()

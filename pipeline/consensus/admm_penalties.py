@@ -24,6 +24,9 @@ from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import BLOCK, AdmmEdge
 from duagc.pipeline.posegraph.least_squares import difference
 
+CURVATURES = (1e-9, 1e8)
+"""Where a measured one is beyond them, nothing pulls, or nothing moves; a receiver refuses what is much further."""
+
 
 def curvature(link: AdmmEdge, T: Array, config: PoseConsensusConfig) -> Array | None:
     """Curvature [2] measured since the last change of penalties: |change of force| / |change of pose|.
@@ -51,7 +54,7 @@ def curvature(link: AdmmEdge, T: Array, config: PoseConsensusConfig) -> Array | 
         if moved == 0.0 or changed == 0.0:
             return None
         stiffness.append(changed / moved)
-    return np.array(stiffness)
+    return np.clip(stiffness, *CURVATURES)
 
 
 def next_penalties(link: AdmmEdge, own: Array, peer: Array, config: PoseConsensusConfig) -> Array:

@@ -39,6 +39,7 @@ PURPOSE = {  # of a message, by its kind
     "VOXELS": "set-up",
     "PAIRS": "set-up",
     "ANCHORS": "set-up",
+    "CURRENT_POSES": "set-up",
     "EVIDENCE": "Gaussians",
     "EVIDENCE_EXACT": "Gaussians",
     "EVIDENCE_DOUBLE": "Gaussians",

@@ -150,6 +150,9 @@ class Agent:
         self._update_poses()
         T_world_map = self._T_world_map() if self.agreed else None
         self.sharing.send_missing(self.radio.send, self.radio.joined, self.alignment.members, T_world_map)
+        for neighbor in self.radio.in_contact:
+            if not neighbor.joined and not neighbor.link.revoked:
+                self.sharing.send_early(self.radio.send, neighbor)
         if self.agreed:
             self.sharing.match(self.others)
         self._finish()
@@ -387,6 +390,8 @@ class Agent:
                 self.radio.send(self.neighbors[receiver], Kind.TREE, labeled)
         if self.agreed:
             return
+        first = self.graph.T_map_keyframe[0]
+        self.sharing.offer_poses(self.poses.T_world_keyframe, first, self.alignment.revoked, self.round)
         refuted = sum(pair_bit(self.own, n.index) for n in joined if self.poses.refuted(n.name))
         if refuted and self.loop_closing.revokes:
             self._revoke_links(self.alignment.revoked | refuted)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
+from duagc.pipeline.config.exchange import EvidenceOrder
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import match
 from duagc.pipeline.consensus.weighting import shared_evidence
@@ -61,9 +63,19 @@ def paper_priority(records: Records) -> Array:
     return np.maximum(records["information"][:, INFORMATION_DIAGONAL].astype(np.float64), 0.0).sum(axis=1)
 
 
-def best_first(records: Records, order: Literal["gain", "paper"] = "gain") -> NDArray[np.int64]:
-    """Order by falling gain (all records have the same size), or by the paper's priority; ties by id."""
-    value = gain(records) if order == "gain" else paper_priority(records)
+def order_of_sending(records: Records, order: EvidenceOrder, seed: int, robot: str) -> NDArray[np.int64]:
+    """Which records [n] go first; ties by id. All have the same size.
+
+    Args:
+        records: of one robot.
+        order: by falling gain or rising gain, by the paper's priority, or random.
+        seed: of the run.
+        robot: its name.
+    """
+    if order == "random":
+        drawn = random_streams.generator(seed, "evidence_order", robot=robot).random(len(records))
+        return np.argsort(drawn, kind="stable")
+    value = {"gain": gain, "paper": paper_priority, "reversed": lambda r: -gain(r)}[order](records)
     return np.lexsort((records["id"], -value))
 
 

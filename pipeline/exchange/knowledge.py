@@ -144,9 +144,7 @@ class Knowledge:
             return None
         return evidence_wire.read_evidence_head(self.kind, chunks[0][:EVIDENCE_HEAD_BYTES], self.team)[1]
 
-    def sound_records(self, owner: int) -> Records:
-        """`records` whose anchor is among the owner's agreed poses; none without agreed poses."""
-        if owner not in self.anchors:
-            return np.zeros(0, evidence_wire.record_dtype(self.kind))
-        records = self.records(owner)
-        return records[records["anchor"] < len(self.anchors[owner].T_common_keyframe)]
+    def sound_records(self, poses: Anchors) -> Records:
+        """`records` of an owner whose anchor is among its poses."""
+        records = self.records(poses.owner)
+        return records[records["anchor"] < len(poses.T_common_keyframe)]

@@ -110,6 +110,11 @@ class LoopClosureProtocol:
         self.tried: list[Tried] = []
         self.peer_keyframes: KeyframePoses | None = None
 
+    @property
+    def promising(self) -> bool:
+        """It is not decided yet, and a loop closure was verified here: the two robots will probably be joined."""
+        return not self.decided and any(t.result.closure is not None for t in self.tried)
+
     def begin(self, send: Send) -> None:
         """Called once, when the ends know their roles."""
 

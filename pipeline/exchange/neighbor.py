@@ -41,6 +41,7 @@ class Passed:
         poses: owners of agreed poses.
         voxels: the space that this robot saw.
         evidence: ids of messages by owner of the evidence.
+        current: newest version of poses that are not final, with the id of its message, by owner.
     """
 
     frames: dict[Pair, int] = field(default_factory=dict)
@@ -48,6 +49,7 @@ class Passed:
     poses: set[int] = field(default_factory=set)
     voxels: bool = False
     evidence: dict[int, int] = field(default_factory=dict)
+    current: dict[int, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.exchange.evidence_records import to_evidence
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.verification import Verdict
-from duagc.pipeline.exchange.wire.state_wire import PairList
+from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
@@ -24,20 +26,15 @@ def result_of(agent: MapAgent) -> SessionResult:
     T_common = {robot: agent.data.T_map_keyframe}
     gauge = np.eye(4)
     others: list[int] = []
+    placed = _placed(agent)
     if agent.poses is not None:
         others = agent.others
-        T_common = {team[i]: a.T_common_keyframe for i, a in sorted(knowledge.anchors.items())}
-        T_common.setdefault(robot, agent.poses.T_world_keyframe)
-        gauge = _gauge(agent)
+        T_common = {team[i]: poses.T_common_keyframe for i, poses in sorted(placed.items())}
+        gauge = _gauge(placed.get(agent.alignment.root))
     T_world = {name: gauge @ T for name, T in T_common.items()} if agent.poses is not None else T_common
     names = [robot, *(team[i] for i in others)]
-    pairs = {
-        (team[p.lower], team[p.higher]): p.ids
-        for p in knowledge.pairs.values()
-        if team[p.lower] in names and team[p.higher] in names and _active(agent, p)
-    }
     own = agent.evidence.own_records()
-    evidence = {team[i]: knowledge.sound_records(i) for i in others if i in knowledge.anchors}
+    evidence = {team[i]: knowledge.sound_records(placed[i]) for i in others if i in placed}
     depths = {team[i]: knowledge.depth(i) for i in others}
     return SessionResult(
         robot=robot,
@@ -48,7 +45,7 @@ def result_of(agent: MapAgent) -> SessionResult:
         evidence={name: to_evidence(name, records) for name, records in evidence.items()},
         # a robot that sent no kind of depth sent no Gaussian either: nothing of it is rendered
         depth_of={name: depths[name] or agent.data.depth for name in evidence},
-        pairs=pairs,
+        pairs=_pairs(agent, placed),
         closures=tuple(_closures(agent)),
         agreed=agent.agreed or not others,
         converged=agent.converged,
@@ -67,9 +64,36 @@ def _active(agent: MapAgent, pairs: PairList) -> bool:
     return neighbor is not None and message is not None and not neighbor.transport.is_open(message)
 
 
-def _gauge(agent: MapAgent) -> Array:
+def _placed(agent: MapAgent) -> dict[int, Anchors]:
+    """Poses by owner: the final ones as far as they have arrived, else the newest ones."""
+    if agent.poses is None:
+        return {}
+    own = Anchors(agent.own, agent.poses.T_world_keyframe, agent.graph.T_map_keyframe[0])
+    newest = agent.evidence.current.known(agent.alignment.revoked)
+    return {**newest, agent.own: own, **agent.knowledge.anchors}
+
+
+def _pairs(agent: MapAgent, placed: Mapping[int, Anchors]) -> dict[tuple[str, str], NDArray[np.int64]]:
+    """Matched Gaussians of the component.
+
+    Where a contact ended before the list of two robots was here, and their poses and some of their evidence are, this
+    robot matches what it has.
+    """
+    team, knowledge = agent.team, agent.knowledge
+    members = sorted({agent.own, *agent.others}) if placed else [agent.own]
+    found = dict[tuple[str, str], NDArray[np.int64]]()
+    for a, b in combinations(members, 2):
+        known = knowledge.pairs.get((a, b))
+        if known is not None and _active(agent, known):
+            found[team[a], team[b]] = known.ids
+        elif a in placed and b in placed:
+            ids = agent.evidence.matched(placed[a], placed[b])
+            found |= {(team[a], team[b]): ids} if len(ids) else {}
+    return found
+
+
+def _gauge(root: Anchors | None) -> Array:
     """T_world_common: the root's first keyframe is where its own map has it. Identity before that has arrived."""
-    root = agent.knowledge.anchors.get(agent.alignment.root)
     if root is None:
         return np.eye(4)
     return root.T_map_first @ se3.inverse(root.T_common_keyframe[0])

@@ -14,7 +14,14 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.recall import Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
-from duagc.pipeline.exchange.evidence_records import best_first, match_pairs, own_records, seen_voxels, within
+from duagc.pipeline.exchange.current_poses import CurrentPoses
+from duagc.pipeline.exchange.evidence_records import (
+    match_pairs,
+    order_of_sending,
+    own_records,
+    seen_voxels,
+    within,
+)
 from duagc.pipeline.exchange.knowledge import Knowledge
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.wire import evidence_wire, state_wire
@@ -59,8 +66,16 @@ class SharedData(Protocol):
     ) -> None:
         """Send every joined neighbor what it lacks."""
 
+    def send_early(self, send: SendTo, n: Neighbor) -> None:
+        """Begin to send a neighbor what it will need if the two robots are joined, or stop if they are not."""
+
     def match(self, others: Sequence[int]) -> None:
         """Match own Gaussians with those of other members, once everything needed is here."""
+
+    def offer_poses(
+        self, T_common_keyframe: Array, T_map_first: Array, revoked: int, round_index: int
+    ) -> None:
+        """Own poses of this round, which are not final."""
 
     def add_poses(self, T_common_keyframe: Array, T_map_first: Array) -> None:
         """Own poses became final."""
@@ -97,8 +112,16 @@ class NoSharing:
     ) -> None:
         """There is nothing to send."""
 
+    def send_early(self, send: SendTo, n: Neighbor) -> None:
+        """There is nothing to send."""
+
     def match(self, others: Sequence[int]) -> None:
         """There is nothing to match."""
+
+    def offer_poses(
+        self, T_common_keyframe: Array, T_map_first: Array, revoked: int, round_index: int
+    ) -> None:
+        """No other robot needs them."""
 
     def add_poses(self, T_common_keyframe: Array, T_map_first: Array) -> None:
         """No other robot needs them."""
@@ -140,6 +163,7 @@ class Sharing:
         self.own = self.team.index(data.robot)
         self.kind = EVIDENCE_WIRES[config.evidence_wire]
         self.knowledge = Knowledge(self.own, len(self.team), self.kind)
+        self.current = CurrentPoses(self.own, len(self.team))
         self._body: NDArray[Any] | None = None
         self._records: NDArray[Any] | None = None
 
@@ -153,7 +177,7 @@ class Sharing:
 
     def _ordered_body(self) -> NDArray[Any]:
         records = own_records(self.data, self.kind, self.config.weights)
-        order = best_first(records, self.config.evidence_order)
+        order = order_of_sending(records, self.config.evidence_order, self.seed, self.data.robot)
         return evidence_wire.to_body(self.kind, records[order])
 
     def own_records(self) -> NDArray[Any]:
@@ -189,6 +213,8 @@ class Sharing:
         k, payload = self.knowledge, arrival.payload
         if arrival.kind is Kind.VOXELS:
             _, n.voxels = state_wire.read_voxels(payload, len(self.team))
+        elif arrival.kind is Kind.CURRENT_POSES:
+            self.current.take(n, payload)
         elif arrival.kind is Kind.ANCHORS:
             n.passed.poses.add(k.take_anchors(payload))
         elif arrival.kind is Kind.PAIRS:
@@ -199,6 +225,19 @@ class Sharing:
                 for provider, message in k.forget_incoming(owner):
                     neighbors[provider].transport.accept_rest(message, round_index)
                 n.transport.accept_rest(arrival.message, round_index)
+
+    def offer_poses(
+        self, T_common_keyframe: Array, T_map_first: Array, revoked: int, round_index: int
+    ) -> None:
+        """Own poses of this round, which are not final: they are flooded, should this contact end before.
+
+        Args:
+            T_common_keyframe: [n, 4, 4], own keyframes in the common frame of the consensus.
+            T_map_first: [4, 4], the first keyframe in the own map.
+            revoked: links that do not count.
+            round_index: the current round.
+        """
+        self.current.offer(Anchors(self.own, T_common_keyframe, T_map_first), revoked, round_index)
 
     def add_poses(self, T_common_keyframe: Array, T_map_first: Array) -> None:
         """Own poses became final: they are flooded.
@@ -238,6 +277,7 @@ class Sharing:
             T_world_map: [4, 4], own map frame in the common one once poses are agreed, else None.
         """
         k = self.knowledge
+        self.current.send_missing(send, joined, set(k.anchors))
         for n in joined:
             if self.config.coverage == "overlap" and T_world_map is not None and not n.passed.voxels:
                 n.passed.voxels = True
@@ -251,6 +291,20 @@ class Sharing:
             for pair in sorted(k.pairs_bytes):
                 if pair[0] != n.index and pair not in n.passed.pairs:
                     n.passed.pairs[pair] = send(n, Kind.PAIRS, k.pairs_bytes[pair])
+
+    def send_early(self, send: SendTo, n: Neighbor) -> None:
+        """Begin to send a neighbor own evidence if the two robots will probably be joined; stop if they are not.
+
+        While a robot waits for samples, nothing else uses its direction of the link.
+
+        Args:
+            send: queues a message.
+            n: the neighbor, which is not joined.
+        """
+        if n.loop_closing is not None and n.loop_closing.promising:
+            self._send_evidence(send, n, [self.own], None)
+        elif n.decided and self.own in n.passed.evidence:
+            n.transport.cancel(n.passed.evidence.pop(self.own))
 
     def _send_evidence(
         self, send: SendTo, n: Neighbor, members: Sequence[int], T_world_map: Array | None
@@ -293,17 +347,31 @@ class Sharing:
 
     # --- matching
 
+    def matched(self, a: Anchors, b: Anchors) -> NDArray[np.int64]:
+        """Ids [n, 2] of matched Gaussians of two robots, of what is here of them.
+
+        Args:
+            a: poses of the lower-named one.
+            b: poses of the other.
+        """
+        matching = self.config.matching.of_maps(self.data.thickness_floor_m)
+        lower, higher = self._placed(a), self._placed(b)
+        name = f"matches {lower[0]} {higher[0]} {_digest(*lower[1:], *higher[1:])}"
+        return self.recall(name, partial(match_pairs, lower, higher, matching))
+
+    def _placed(self, poses: Anchors) -> tuple[str, NDArray[Any], Array]:
+        """Name of a robot, what is here of its evidence, and its poses."""
+        own = poses.owner == self.own
+        records = self.own_records() if own else self.knowledge.sound_records(poses)
+        return self.team[poses.owner], records, poses.T_common_keyframe
+
     def match(self, others: Sequence[int]) -> None:
         """Match own Gaussians with those of every higher-named member, once everything needed is here."""
         k = self.knowledge
         for other in others:
             ready = other in k.anchors and other in k.evidence and (self.own, other) not in k.pairs
             if self.own < other and ready:
-                mine = self.data.robot, self.own_records(), k.anchors[self.own].T_common_keyframe
-                theirs = self.team[other], k.sound_records(other), k.anchors[other].T_common_keyframe
-                matching = self.config.matching.of_maps(self.data.thickness_floor_m)
-                name = f"matches {mine[0]} {theirs[0]} {_digest(*mine[1:], *theirs[1:])}"
-                ids = self.recall(name, partial(match_pairs, mine, theirs, matching))
+                ids = self.matched(k.anchors[self.own], k.anchors[other])
                 ids = injection.false_matches(
                     ids, self.config.injection, seed=self.seed, robot=self.data.robot, peer=self.team[other]
                 )

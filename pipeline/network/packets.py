@@ -54,6 +54,7 @@ class Kind(IntEnum):
     KEYFRAMES = 14  # own keyframes that known loop closures name (`duagc posegraph`)
     HELLO = 16  # digest of what the sender saw, from which the roles of the two ends follow
     TREE = 15  # elimination: fronts and blocks up the tree of robots, steps down
+    CURRENT_POSES = 17  # poses of the keyframes of one robot while they are sought
 
 
 FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})

@@ -1,7 +1,9 @@
 """Reliable messages to one neighbor: cutting, bursts within a budget, selective acknowledgement, reassembly.
 
 A burst holds, in this order: acknowledgements, the state of this round, then the open messages by kind and id,
-what is overdue before what is new. Nothing here looks into a payload, except that evidence is passed on chunk by chunk.
+what is overdue before what is new. Where packets wait in a queue, acknowledgements say so to the sender, which then
+sends what the link takes (`congestion`). Nothing here looks into a payload, except that evidence is passed on chunk by
+chunk.
 """
 
 from __future__ import annotations
@@ -15,6 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.network import TransportConfig
+from duagc.pipeline.network.congestion import (
+    FULL_ROUNDS,
+    MOST_ROUNDS,
+    WINDOW_ROUNDS,
+    Congestion,
+    LinkObserver,
+    SendRate,
+)
 from duagc.pipeline.network.packets import (
     EVIDENCE_KINDS,
     HEADER_BYTES,
@@ -30,6 +40,10 @@ from duagc.pipeline.network.packets import (
 from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
 
 _ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks; then one bit per chunk
+_FULL_LINK = struct.Struct(
+    "<IIHI"
+)  # no message, bytes a round that the link takes, late rounds, round of sending
+_FULL_LINK_ID = 2**32 - 1
 MAX_REPEATS = 32
 SEQUENCE_BLOCK = 1024
 ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
@@ -86,7 +100,7 @@ class Arrival:
 
 @dataclass
 class _Open:
-    """An outgoing message: which chunks are acknowledged, and from which round each may be sent (again)."""
+    """An outgoing message: which chunks are acknowledged, and from which round each may be sent (again); at first 0."""
 
     message: Message
     acknowledged: NDArray[np.bool_]
@@ -151,14 +165,15 @@ class Transport:
         self._to_acknowledge: dict[int, _News] = {}
         self._packets_heard = self._highest_sequence = 0
         self._heard: dict[int, int] = {}  # sequence numbers, a mask for each block of SEQUENCE_BLOCK
-        self._delay_rounds: int | None = None  # least seen between sending and arrival
+        self._observer = LinkObserver()
+        self._rate = SendRate()
 
     # --- outgoing
 
     def send(self, message: Message) -> None:
         """Queue a reliable message."""
         n = chunk_count(message.kind, len(message.payload))
-        self._open[message.id] = _Open(message, np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64))
+        self._open[message.id] = _Open(message, np.zeros(n, bool), np.zeros(n, np.int64))
 
     def cancel(self, message: int) -> None:
         """Stop sending a message, if it is still open."""
@@ -198,11 +213,14 @@ class Transport:
             budget_bytes: most that may be sent, headers included.
         """
         out: list[Outgoing] = []
-        for message in [*self._acknowledgements(round_index), *states]:
+        acknowledgements = self._acknowledgements(round_index)
+        most_bytes, budget_bytes = budget_bytes, self._rate.budget(budget_bytes, round_index)
+        for message in [*acknowledgements, *states]:
             budget_bytes -= self._overhead_bytes + len(message.payload)
             if budget_bytes < 0:
                 return out
             out.append(self._packet(message, 0, round_index))
+        more = False
         if self.in_contact(round_index):
             for entry, chunk in self._due(round_index):
                 size = self._overhead_bytes + min(
@@ -210,10 +228,21 @@ class Transport:
                     len(entry.message.payload) - chunk * chunk_bytes(entry.message.kind),
                 )
                 if size > budget_bytes:
+                    more = True
                     break
                 budget_bytes -= size
-                entry.due_round[chunk] = round_index + self._retransmit_after(entry.message.kind)
+                after_rounds = self._retransmit_after(entry.message.kind) + self._rate.queued_rounds
+                entry.due_round[chunk] = round_index + after_rounds
                 out.append(self._packet(entry.message, chunk, round_index))
+        wait_rounds = self._round_trip + FULL_ROUNDS + WINDOW_ROUNDS
+        self._rate.sent(
+            sum(len(o.packet) for o in out),
+            budget_bytes,
+            most_bytes,
+            wait_rounds=wait_rounds,
+            round_index=round_index,
+            more=more,
+        )
         return out
 
     @property
@@ -226,13 +255,23 @@ class Transport:
 
         What others wait for goes out again the sooner the more is lost: an answer that will not come is no use.
         """
-        rounds = max(self.config.retransmit_after_rounds, 2 * (self._delay_rounds or 0) + 2)
+        rounds = max(self.config.retransmit_after_rounds, self._round_trip)
         heard = self._packets_heard / (self._highest_sequence + 1)
         return max(1, round(rounds * heard)) if kind in URGENT_KINDS else rounds
 
+    @property
+    def _round_trip(self) -> int:
+        """Rounds there and back when nothing waits, with room for the two ends."""
+        return 2 * (self._observer.least_delay or 0) + 2
+
     def _due(self, round_index: int) -> Iterator[tuple[_Open, int]]:
+        """Chunks to send, in order; overdue ones later if acknowledgements have to wait."""
+        waits = self._observer.excess_rounds(round_index)
         for entry in sorted(self._open.values(), key=_priority):
-            for chunk in np.flatnonzero(~entry.acknowledged & (entry.due_round <= round_index)).tolist():
+            late = np.where(entry.due_round > 0, waits, 0)
+            for chunk in np.flatnonzero(
+                ~entry.acknowledged & (entry.due_round + late <= round_index)
+            ).tolist():
                 yield entry, chunk
 
     def _packet(self, message: Message, chunk: int, round_index: int) -> Outgoing:
@@ -262,6 +301,11 @@ class Transport:
                 parts.append(head + np.packbits(bits, bitorder="little").tobytes())
             if news.until_round <= round_index:
                 del self._to_acknowledge[message]
+        full = self._observer.congestion(round_index)
+        if full is not None:
+            self._rate.guess(full, round_index)
+            said = (full.bytes_per_round, min(full.excess_rounds, MOST_ROUNDS), full.sent_round)
+            parts.insert(0, _FULL_LINK.pack(_FULL_LINK_ID, *said))
         payloads: list[bytes] = []
         for part in parts:
             if payloads and len(payloads[-1]) + len(part) <= MAX_PAYLOAD_BYTES:
@@ -306,11 +350,11 @@ class Transport:
             return None  # a copy that the network made, or a replayed packet
         self.last_heard = round_index
         self._packets_heard += 1
-        delay = max(0, round_index - packet.round)
-        self._delay_rounds = delay if self._delay_rounds is None else min(self._delay_rounds, delay)
+        size = self._overhead_bytes + len(packet.payload)
+        self._observer.heard(packet.sequence, packet.round, round_index, size)
         self._highest_sequence = max(self._highest_sequence, packet.sequence)
         if packet.kind is Kind.ACK:
-            self._take_acknowledgements(packet.payload)
+            self._take_acknowledgements(packet.payload, round_index)
             return None
         if packet.kind is Kind.STATE:
             return Arrival(packet.kind, packet.message, packet.payload, complete=True)
@@ -368,13 +412,20 @@ class Transport:
             last = chunk_count(partial.kind, partial.total) - 1
             self._to_acknowledge[message] = _News(0, last, round_index + self._repeats())
 
-    def _take_acknowledgements(self, payload: bytes) -> None:
+    def _take_acknowledgements(self, payload: bytes, round_index: int) -> None:
         """Mark what the neighbor acknowledges; acknowledgements of anything else have no effect."""
         position = 0
         while position < len(payload):
             if position + _ACK_HEAD.size > len(payload):
                 raise MalformedError("acknowledgement is cut short")
             message, base, count = _ACK_HEAD.unpack_from(payload, position)
+            if message == _FULL_LINK_ID and position + _FULL_LINK.size <= len(payload):
+                _, carried, excess, sent_round = _FULL_LINK.unpack_from(payload, position)
+                position += _FULL_LINK.size
+                late = self._rate.take(Congestion(excess, carried, sent_round), round_index)
+                for waiting in self._open.values():
+                    waiting.due_round[waiting.due_round > 0] += late
+                continue
             position += _ACK_HEAD.size
             size = -(-count // 8)
             if position + size > len(payload):

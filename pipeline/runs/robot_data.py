@@ -108,9 +108,9 @@ class SessionResult:
         component: names of the robots that share its world frame, sorted; only itself if it met no other robot.
         T_world_keyframe: [n, 4, 4], own keyframes in the map frame of component[0]; exactly those of its own
             map if it is alone.
-        T_world_keyframe_of: the same of every member, itself included, as far as their agreed poses arrived.
+        T_world_keyframe_of: the same of every member, itself included, as far as their poses arrived.
         own_evidence: as it was sent, sorted by id.
-        evidence: of the other members with agreed poses, by name, as far as it arrived.
+        evidence: of the other members whose poses arrived, by name, as far as it arrived.
         depth_of: of a Gaussian at a pixel, as their maps were made, by name.
         pairs: ids of matched Gaussians, int64 [n, 2], by (lower, higher) name.
         closures: every candidate that this robot decided on.

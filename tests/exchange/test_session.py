@@ -15,7 +15,7 @@ import pytest
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig, InjectionConfig
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
-from duagc.pipeline.exchange.evidence_records import best_first, own_records, paper_priority
+from duagc.pipeline.exchange.evidence_records import gain, order_of_sending, own_records, paper_priority
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.replay import replay_agent_of
@@ -163,9 +163,14 @@ def test_the_printed_order_of_evidence_depends_on_the_unit_of_length(team: Any) 
     records = own_records(team["alpha"][0], Kind.EVIDENCE_DOUBLE, ExchangeConfig().weights)
     in_cm = records.copy()
     in_cm["information"][:, :6] /= 100.0**2
-    by_paper = [best_first(r, "paper") for r in (records, in_cm)]
+    by_paper = [order_of_sending(r, "paper", 0, "alpha") for r in (records, in_cm)]
     assert not np.array_equal(*by_paper)
-    for order in (*by_paper, best_first(records)):
+    by_gain, reverse = (order_of_sending(records, kind, 0, "alpha") for kind in ("gain", "reversed"))
+    assert np.array_equal(gain(records)[by_gain], gain(records)[reverse[::-1]])
+    drawn = [order_of_sending(records, "random", seed, "alpha") for seed in (0, 0, 1)]
+    assert np.array_equal(drawn[0], drawn[1])
+    assert not np.array_equal(drawn[0], drawn[2])
+    for order in (*by_paper, by_gain, reverse, *drawn):
         assert np.array_equal(np.sort(order), np.arange(len(records)))
     value = paper_priority(records)[by_paper[0]]
     assert np.all(np.diff(value) <= 0)
