@@ -137,12 +137,24 @@ class Knowledge:
 
     def depth(self, owner: int) -> DepthKind | None:
         """Of a Gaussian at a pixel, as the owner's map was made; None if nothing of its evidence is here."""
+        head = self._head(owner)
+        return None if head is None else head[0]
+
+    def share(self, owner: int) -> float:
+        """Share of an owner's evidence that is here, by what it says of the number of its Gaussians."""
+        head = self._head(owner)
+        if owner in self.evidence or head is None:
+            return float(owner in self.evidence)
+        return min(1.0, len(self.records(owner)) / max(1, head[1]))
+
+    def _head(self, owner: int) -> tuple[DepthKind, int] | None:
+        """Kind of depth and number of Gaussians of an owner; None if nothing of its evidence is here."""
         chunks = [self.evidence_bytes[owner]] if owner in self.evidence_bytes else []
         for key in sorted(k for k, entry in self.incoming.items() if entry.owner == owner):
             chunks += self.incoming[key].chunks
         if not chunks:
             return None
-        return evidence_wire.read_evidence_head(self.kind, chunks[0][:EVIDENCE_HEAD_BYTES], self.team)[1]
+        return evidence_wire.read_evidence_head(self.kind, chunks[0][:EVIDENCE_HEAD_BYTES], self.team)[1:]
 
     def sound_records(self, poses: Anchors) -> Records:
         """`records` of an owner whose anchor is among its poses."""

@@ -110,6 +110,7 @@ def validate_peer_maps(
     *,
     views: Sequence[PosedRgbd],
     depth_kinds: Mapping[str, DepthKind],
+    arrived: Mapping[str, float],
 ) -> ValidatedPeers:
     """Compare every peer's map with the robot's own keyframes.
 
@@ -120,6 +121,7 @@ def validate_peer_maps(
         context: camera and settings.
         views: own keyframes at their corrected poses.
         depth_kinds: as the peers' maps were made, by name.
+        arrived: share of their Gaussians that are here, by name.
     """
     config, matching = context.config.peer_validation, context.matching
     own_colors = _ColorStatistics(config.min_color_variance)
@@ -133,7 +135,7 @@ def validate_peer_maps(
         possible = _sizes_m(peers[name]) <= largest_m
         peer, too_large[name] = peers[name].select(possible), int(np.sum(~possible))
         near = _near(own, peer, _between(pairs, own.owner, name), radius_m)
-        judged[name] = _PhotometricCheck(views, context, depth_kinds[name], config)
+        judged[name] = _PhotometricCheck(views, context, depth_kinds[name], config, arrived[name])
         against = judged[name].contradicted(_in_colors_of(own, peer, near, matching), own_colors.variance)
         used = slice(None) if judged[name].trusted(own_colors.pixels) else slice(0, 0)
         world[name], contradicted[name] = peer.select(used), against[used]
@@ -250,6 +252,7 @@ class _PhotometricCheck:
     """Renders one peer's map at own keyframes.
 
     Attributes:
+        explained: share of the variance of own pixels that the map must explain.
         own: own colors at the pixels on which the whole map was compared.
         color_mse: mean squared error of the map there, colors 0..1.
         num_contradicted: Gaussians that own images contradict.
@@ -261,15 +264,20 @@ class _PhotometricCheck:
         context: MapContext,
         depth_kind: DepthKind,
         config: PeerValidationConfig,
+        arrived: float,
     ) -> None:
+        self.explained = config.min_explained_variance * arrived
         self.views, self.context, self.depth_kind, self.config = views, context, depth_kind, config
         self.rasterizer = Rasterizer(threads=context.threads)
         self.own, self.color_mse = _ColorStatistics(config.min_color_variance), 0.0
         self.num_contradicted = 0
 
     def trusted(self, own_px: int) -> bool:
-        """Whether the map explains own images, or too few of all own pixels see it to decide."""
-        explains = self.color_mse <= (1 - self.config.min_explained_variance) * self.own.variance
+        """Whether the map explains own images, or too few of all own pixels see it to decide.
+
+        Of a map with holes as much is expected as there is of it; what is wrong explains nothing, however little it is.
+        """
+        explains = self.color_mse <= (1 - self.explained) * self.own.variance
         return explains or self.own.pixels < self.config.min_overlap * own_px
 
     def contradicted(self, world: Evidence, gray: float) -> NDArray[np.bool_]:

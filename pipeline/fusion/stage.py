@@ -156,6 +156,7 @@ def _untrained(
         context,
         views=keyframe_views,
         depth_kinds=result.depth_of,
+        arrived=result.arrived,
     )
     own_information = self_information(
         own.robot, own.gaussians, own.information, own.T_map_keyframe, kind=context.weights

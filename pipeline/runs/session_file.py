@@ -17,7 +17,7 @@ from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
 
 NAME = "session.npz"
-SCHEMA = 1
+SCHEMA = 2
 _FAST = 1  # level of the compression: evidence is noise for the most part
 
 
@@ -38,6 +38,7 @@ def write_session_result(path: Path, result: SessionResult) -> None:
         "own_evidence": _plain_evidence(result.own_evidence, arrays),
         "evidence": {name: _plain_evidence(e, arrays) for name, e in result.evidence.items()},
         "depth_of": result.depth_of,
+        "arrived": result.arrived,
         "pairs": [[lower, higher, arrays.add(ids)] for (lower, higher), ids in result.pairs.items()],
         "closures": [_plain_closure(closure, arrays) for closure in result.closures],
         "agreed": result.agreed,
@@ -140,6 +141,7 @@ def _result(plain: dict[str, Any], array: _Reader) -> SessionResult:
         own_evidence=_evidence(plain["own_evidence"], array),
         evidence={name: _evidence(e, array) for name, e in plain["evidence"].items()},
         depth_of=plain["depth_of"],
+        arrived=plain["arrived"],
         pairs={(lower, higher): array(ids) for lower, higher, ids in plain["pairs"]},
         closures=tuple(_closure(closure, array) for closure in plain["closures"]),
         agreed=plain["agreed"],

@@ -58,7 +58,7 @@ def map_of(robot: str, change=lambda theta: None, discs=()) -> Evidence:
 
 
 def validated_by_alpha(
-    views: list[PosedRgbd], bravo: Evidence, pairs=None, threads: int = 1
+    views: list[PosedRgbd], bravo: Evidence, pairs=None, threads: int = 1, arrived: float = 1.0
 ) -> ValidatedPeers:
     ids = 10 + np.arange(N)
     pairs = {("alpha", "bravo"): np.stack([ids, ids], axis=1)} if pairs is None else pairs
@@ -69,6 +69,7 @@ def validated_by_alpha(
         MapContext(CAMERA, FusionConfig(), MapMatching(), threads=threads),
         views=views,
         depth_kinds={"bravo": "blended"},
+        arrived={"bravo": arrived},
     )
 
 
@@ -97,6 +98,21 @@ def test_made_up_colors_leave_a_neighbor_out(views, color):
     assert not check.trusted
     assert "contradicts own images" in check.reason
     assert len(validated.evidence["bravo"]) == len(validated.pairs["alpha", "bravo"]) == 0
+
+
+@pytest.mark.parametrize(("share", "trusted"), [(1.0, False), (0.3, True)])
+def test_of_a_part_of_a_map_less_is_expected(views, share, trusted):
+    """Colors that explain a seventh of the variance: too little for a map, enough for a third of one."""
+    noise = np.random.default_rng(0).normal(size=(N, 3))
+    part = map_of("bravo", repaint(lambda c: c + 2.6 * c.std() * noise))
+    (check,) = validated_by_alpha(views, part, arrived=share).checks
+    assert 0.7 < check.color_mse / check.color_variance < 0.9
+    assert check.trusted == trusted
+
+
+@pytest.mark.parametrize("color", [lambda c: 1 - c, lambda c: np.zeros_like(c) + c.mean(axis=0)])
+def test_a_small_part_of_a_lie_is_a_lie(views, color):
+    assert not validated_by_alpha(views, map_of("bravo", repaint(color)), arrived=0.02).checks[0].trusted
 
 
 def test_another_camera_is_no_lie(views):

@@ -59,6 +59,10 @@ class Result:
     def depth_of(self) -> dict[str, str]:
         return dict.fromkeys(self.evidence, "blended")
 
+    @property
+    def arrived(self) -> dict[str, float]:
+        return dict.fromkeys(self.evidence, 1.0)
+
 
 @dataclass
 class Robot:

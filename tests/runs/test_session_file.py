@@ -44,6 +44,7 @@ def result() -> SessionResult:
         own_evidence=evidence("bravo", 5, rounded=False),
         evidence={"alpha": evidence("alpha", 400, rounded=True)},
         depth_of={"alpha": "ray_plane"},
+        arrived={"alpha": 0.3},
         pairs={("alpha", "bravo"): np.array([[1, 2], [3, 4]])},
         closures=(closure, replace(closure, T_own_peer=None, weight=None)),
         agreed=True,
