@@ -45,6 +45,8 @@ _FULL_LINK = struct.Struct(
 )  # no message, bytes a round that the link takes, late rounds, round of sending
 _FULL_LINK_ID = 2**32 - 1
 MAX_REPEATS = 32
+LAST_CHUNKS = 3
+LOSSY = 0.97  # share of packets heard below which a link loses some
 SEQUENCE_BLOCK = 1024
 ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
 
@@ -256,8 +258,12 @@ class Transport:
         What others wait for goes out again the sooner the more is lost: an answer that will not come is no use.
         """
         rounds = max(self.config.retransmit_after_rounds, self._round_trip)
-        heard = self._packets_heard / (self._highest_sequence + 1)
-        return max(1, round(rounds * heard)) if kind in URGENT_KINDS else rounds
+        return max(1, round(rounds * self._share_heard)) if kind in URGENT_KINDS else rounds
+
+    @property
+    def _share_heard(self) -> float:
+        """Share of the neighbor's packets that arrived here, by the gaps in their sequence numbers."""
+        return self._packets_heard / (self._highest_sequence + 1)
 
     @property
     def _round_trip(self) -> int:
@@ -265,13 +271,20 @@ class Transport:
         return 2 * (self._observer.least_delay or 0) + 2
 
     def _due(self, round_index: int) -> Iterator[tuple[_Open, int]]:
-        """Chunks to send, in order; overdue ones later if acknowledgements have to wait."""
+        """Chunks to send, in order; overdue ones later if acknowledgements have to wait.
+
+        Where packets are lost, the last chunks of a message that is no evidence go in every round: while the neighbor
+        waits for them, the link has little else to do.
+        """
         waits = self._observer.excess_rounds(round_index)
+        repeats = self._share_heard < LOSSY and waits + self._rate.queued_rounds < FULL_ROUNDS
         for entry in sorted(self._open.values(), key=_priority):
             late = np.where(entry.due_round > 0, waits, 0)
-            for chunk in np.flatnonzero(
-                ~entry.acknowledged & (entry.due_round + late <= round_index)
-            ).tolist():
+            missing = ~entry.acknowledged
+            last = missing.sum() <= LAST_CHUNKS and entry.message.kind not in EVIDENCE_KINDS
+            if not (repeats and last):
+                missing &= entry.due_round + late <= round_index
+            for chunk in np.flatnonzero(missing).tolist():
                 yield entry, chunk
 
     def _packet(self, message: Message, chunk: int, round_index: int) -> Outgoing:
@@ -319,7 +332,7 @@ class Transport:
 
         The loss is that of the packets heard, seen from the gaps in their sequence numbers: none, no repetition.
         """
-        loss = 1.0 - self._packets_heard / (self._highest_sequence + 1)
+        loss = 1.0 - self._share_heard
         if loss <= 0.0:
             return 0
         return min(MAX_REPEATS, math.ceil(math.log(0.05) / math.log(loss)))
