@@ -79,9 +79,12 @@ class ExchangeConfig(Config):
     """Length of one round."""
     max_rounds: int = Field(default=3000, ge=1)
     """The session ends here, whatever has been agreed."""
-    solver: Literal["admm", "elimination"] = "admm"
+    solver: Literal["admm", "elimination", "algorithm_1", "algorithm_1_printed"] = "admm"
     """Of the poses. admm: relaxed edge-ADMM, a few poses per round and link; elimination: exact steps along a tree of
-    robots, matrices in few rounds."""
+    robots, matrices in few rounds; to compare with, Algorithm 1 of the paper, by which matched Gaussians move poses:
+    with the corrections that it needs, or as printed."""
+    algorithm_1_penalty: float = Field(default=0.01, gt=0.0)
+    """rho of Algorithm 1 as printed, as a multiple of the loop closures' information; larger ones diverge sooner."""
     elimination_wire: Literal["float32", "float64"] = "float64"
     """Precision of the matrices of elimination on the wire."""
     coverage: Literal["all", "overlap"] = "all"

@@ -425,7 +425,8 @@ class Agent:
         self.links = {n.index: starts.of(n) for n in self.radio.joined}
         T_world_map = self.alignment.T_world_first(self.own)
         tree, links = self.alignment.tree(), list(self.links.values())
-        self.poses = self._make_solver(SolverStart(self.graph, self.own, T_world_map, tree, links))
+        matcher = self.sharing.matcher
+        self.poses = self._make_solver(SolverStart(self.graph, self.own, T_world_map, tree, links, matcher))
         for n in self.radio.joined:
             for revoked, payload in n.early:
                 if revoked == self.alignment.revoked:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.recall import Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.consensus.evidence import rows_by_id
 from duagc.pipeline.exchange import injection
 from duagc.pipeline.exchange.current_poses import CurrentPoses
 from duagc.pipeline.exchange.evidence_records import (
@@ -24,11 +25,13 @@ from duagc.pipeline.exchange.evidence_records import (
 )
 from duagc.pipeline.exchange.knowledge import Knowledge
 from duagc.pipeline.exchange.neighbor import Neighbor
+from duagc.pipeline.exchange.solvers import Matcher
 from duagc.pipeline.exchange.wire import evidence_wire, state_wire
 from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList, State
 from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.network.transport import Arrival
 from duagc.pipeline.runs.robot_data import RobotData
+from duagc.pipeline.splat.information import MEAN, mean_block
 
 EVIDENCE_WIRES = {
     "compact": Kind.EVIDENCE,
@@ -47,10 +50,14 @@ class SharedData(Protocol):
     Attributes:
         enabled: evidence is shared; if not, only poses are agreed.
         knowledge: what came from others.
+        matcher: of Gaussians, for solvers that use them; None if there are none.
     """
 
     enabled: bool
     knowledge: Knowledge
+
+    @property
+    def matcher(self) -> Matcher | None: ...
 
     def take(
         self, n: Neighbor, arrival: Arrival, round_index: int, neighbors: Mapping[int, Neighbor]
@@ -91,6 +98,7 @@ class NoSharing:
     """Only poses are agreed; nothing else is shared."""
 
     enabled = False
+    matcher = None
 
     def __init__(self, own: int, team: int) -> None:
         """Nothing is known, and nothing will be.
@@ -358,6 +366,49 @@ class Sharing:
         lower, higher = self._placed(a), self._placed(b)
         name = f"matches {lower[0]} {higher[0]} {_digest(*lower[1:], *higher[1:])}"
         return self.recall(name, partial(match_pairs, lower, higher, matching))
+
+    @property
+    def matcher(self) -> Matcher:
+        """This."""
+        return self
+
+    def is_here(self, owner: int) -> bool:
+        """Whether the evidence of a robot is here."""
+        return owner == self.own or owner in self.knowledge.evidence
+
+    def matched_at(self, other: int, T_own: Array, T_other: Array) -> NDArray[np.int64] | None:
+        """Ids [p, 2] of own Gaussians and those of a robot that match; None if those are not here.
+
+        Args:
+            other: index of the robot, after this one in the team.
+            T_own: [n, 4, 4], own keyframes in the common frame.
+            T_other: [k, 4, 4], those of the other.
+        """
+        if not self.is_here(other):
+            return None
+        nowhere = np.eye(4)
+        return self.matched(Anchors(self.own, T_own, nowhere), Anchors(other, T_other, nowhere))
+
+    def positions(self, owner: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array, Array]:
+        """Keyframes [p] that Gaussians hang on, their means [p, 3] and the information of these [p, 3, 3], there.
+
+        Args:
+            owner: index of the robot.
+            ids: [p] of its Gaussians.
+
+        Raises:
+            MalformedError: one of them is not here.
+        """
+        records = self.own_records() if owner == self.own else self.knowledge.records(owner)
+        rows = rows_by_id(ids, records["id"])
+        if len(rows) and rows.min() < 0:
+            raise MalformedError("pairs: a Gaussian that is not here")
+        information = mean_block(records["information"][rows].astype(np.float64))
+        return (
+            records["anchor"][rows].astype(np.int64),
+            records["theta"][rows, MEAN].astype(np.float64),
+            information,
+        )
 
     def _placed(self, poses: Anchors) -> tuple[str, NDArray[Any], Array]:
         """Name of a robot, what is here of its evidence, and its poses."""

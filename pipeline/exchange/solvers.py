@@ -46,6 +46,23 @@ class LinkStart:
     T_world_keyframe: Array
 
 
+class Matcher(Protocol):
+    """What a solver may know of Gaussians."""
+
+    def is_here(self, owner: int) -> bool:
+        """Whether the evidence of a robot is here."""
+
+    def matched_at(self, other: int, T_own: Array, T_other: Array) -> NDArray[np.int64] | None:
+        """Ids [p, 2] of own Gaussians and those of a neighbor that match at these poses; None if they are not here."""
+
+    def positions(self, owner: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array, Array]:
+        """Keyframes [p] that Gaussians hang on, their means [p, 3] and the information of these [p, 3, 3], there.
+
+        Raises:
+            MalformedError: one of them is not here.
+        """
+
+
 @dataclass(frozen=True)
 class SolverStart:
     """What a robot knows when the pose rounds begin.
@@ -56,6 +73,7 @@ class SolverStart:
         T_world_map: [4, 4], where its first keyframe was placed.
         tree: its place in the tree along which the maps were placed.
         links: joined neighbors.
+        matcher: of Gaussians; None if there are none.
     """
 
     own: OwnGraph
@@ -63,6 +81,7 @@ class SolverStart:
     T_world_map: Array
     tree: TreePlace
     links: Sequence[LinkStart]
+    matcher: Matcher | None = None
 
 
 class PoseSolver(Protocol):
@@ -334,6 +353,11 @@ def solver_of(config: ExchangeConfig, team: int) -> SolverFactory:
     def make(start: SolverStart) -> PoseSolver:
         if config.solver == "admm":
             return AdmmSolver(start, config.consensus)
+        if config.solver != "elimination":
+            from duagc.pipeline.exchange.algorithm_1 import Algorithm1Solver  # which needs this module
+
+            printed = config.solver == "algorithm_1_printed"
+            return Algorithm1Solver(start, config.consensus, config.algorithm_1_penalty if printed else None)
         return EliminationSolver(start, config.consensus, team, config.elimination_wire)
 
     return make

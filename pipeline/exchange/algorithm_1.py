@@ -1,0 +1,418 @@
+"""Algorithm 1 of the paper, (8) to (14): poses and matched Gaussians move together; as printed, and corrected.
+
+Every round a robot moves its keyframes, with what last came from its neighbors held still, and sends them. Its cost is
+that of its own relative poses, of the loop closures with its neighbors, which both ends have, and of the *pair terms*:
+the distances of matched Gaussians in the common frame.
+
+    printed    one Riemannian gradient step with Armijo backtracking (11) on the augmented Lagrangian (10); loop
+               closures are constraints with multipliers (14), whose residual is that of the measured relative pose,
+               because the printed one vanishes for no measurement but the identity; a pair weighs the sum of both
+               informations (8); then own matched means become the average with the neighbor's last ones, by
+               information and dimension (12), and are sent with the poses.
+    corrected  one damped Gauss-Newton step on the same terms without multipliers; a pair weighs the parallel sum of
+               both informations, with the scatter of matched Gaussians, and for as many as share a pixel once; means
+               stay what each robot saw. Its fixed point is the minimum over all poses and all matched means.
+
+Of a Gaussian only its mean acts on poses; covariances and colors (13) are averaged by fusion, at the final poses.
+The lower-named robot of a pair matches once, when the evidence is here.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.consensus.admm_edge import PosePacket, rounded
+from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.exchange.solvers import LinkStart, Matcher, SolverStart
+from duagc.pipeline.exchange.wire.algorithm_1_wire import (
+    Setup,
+    read_means,
+    read_pairs,
+    read_setup,
+    write_means,
+    write_pairs,
+    write_setup,
+)
+from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.spd import add_covariance
+from duagc.pipeline.network.packets import MalformedError
+from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.least_squares import retract
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
+
+ARMIJO, HALVINGS = 0.75, 40
+"""Of the decrease that the slope promises. The two ends of a link step at once: with the customary 1e-4, which accepts
+nearly twice the way to the minimum, each overshoots where the other was, and both fly apart."""
+PRIMAL = 1e-4  # m, rad: the paper's stopping test
+DAMPING = 0.7  # both ends of a link step at once
+SCATTER_M = 0.01
+SPLATS_PER_SAMPLE = 30.0
+ROUNDS_BEFORE_MATCHING = 10
+STILL_ROUNDS = 8
+POSES, MEANS = b"\0", b"\1"
+_HEAD = struct.Struct("<I")  # round of the sender
+
+
+@dataclass
+class _Pairs:
+    """Matched Gaussians with one neighbor.
+
+    Attributes:
+        anchor: [p] own keyframes.
+        mean: [p, 3], own means in these keyframes.
+        peer_anchor: [p] keyframes of the neighbor.
+        peer_mean: [p, 3], its means there, as it sent its evidence.
+        weight: [p, 3, 3], of the distance, in the common frame.
+        own_share: [p, 3], of the own value in an average.
+        peer_common: [p, 3], the neighbor's means in the common frame, as they last came; as printed only.
+    """
+
+    anchor: NDArray[np.int64]
+    mean: Array
+    peer_anchor: NDArray[np.int64]
+    peer_mean: Array
+    weight: Array
+    own_share: Array
+    peer_common: Array
+
+
+@dataclass
+class _Peer:
+    """What is known of one neighbor.
+
+    Attributes:
+        link: as the solver got it.
+        poses: [k, 4, 4], its keyframes; None before they came.
+        between: loop closures with it, as factors of own keyframes and then of its.
+        multipliers: of these.
+        pairs: None before they are known.
+        newest: round of its last poses.
+    """
+
+    link: LinkStart
+    poses: Array | None = None
+    between: RelativePoses = field(default_factory=RelativePoses.empty)
+    multipliers: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    pairs: _Pairs | None = None
+    newest: int = -1
+
+
+class Algorithm1Solver:
+    """One robot's side of Algorithm 1.
+
+    Attributes:
+        refused: reasons why kept messages could not be used.
+    """
+
+    def __init__(self, start: SolverStart, config: PoseConsensusConfig, penalty: float | None) -> None:
+        """Lay out the graph.
+
+        Args:
+            start: what the robot knows.
+            config: the same at all robots.
+            penalty: rho of (10), as a multiple of the loop closures' information, as printed; None for
+                the corrected one.
+        """
+        if start.matcher is None:
+            raise ValueError("Algorithm 1 needs Gaussians to match")
+        self.config, self.own = config, start.index
+        self.printed, self._penalty = penalty is not None, 1.0 if penalty is None else penalty
+        self.refused: list[str] = []
+        self._matcher: Matcher = start.matcher
+        self._x = start.T_world_map @ start.own.T_first_keyframe
+        loops = start.own.loops.select(np.asarray(start.own.keep_loops, dtype=bool))
+        self._factors = with_floor(RelativePoses.concatenate([start.own.relative_poses, loops]), config)
+        self._loops = start.own.keep_loops.astype(np.float64)
+        self._peers = {link.index: _Peer(link) for link in start.links}
+        self._arrived: list[tuple[int, bytes]] = []
+        self._outbox = [(link.index, self._setup(link)) for link in start.links]
+        self._length, self._step, self._rounds, self._still = 1.0, np.inf, 0, 0
+
+    def _setup(self, link: LinkStart) -> bytes:
+        kept = [c for c, keep in zip(link.closures, link.keep.tolist(), strict=True) if keep]
+        return write_setup(Setup(self._x, tuple(kept)))
+
+    # --- one round
+
+    def advance(self) -> None:
+        """Use what came; move the poses (11), average the means (12), add to the multipliers (14)."""
+        self._take_arrived()
+        self._rounds += 1
+        self._match()
+        if any(peer.poses is None for peer in self._peers.values()):
+            return
+        x = self._gradient_step() if self.printed else self._newton_step()
+        self._step = float(np.abs(least_squares.difference(x, self._x)).max())
+        self._x = x
+        self._still = self._still + 1 if self._step < self.config.tolerance else 0
+        if self.printed:
+            for peer in self._peers.values():
+                self._average(peer.pairs)
+                peer.multipliers = peer.multipliers + self._penalty * self._residuals(peer)
+
+    def _residuals(self, peer: _Peer) -> Array:
+        assert peer.poses is not None
+        return least_squares.residuals(peer.between, np.concatenate([self._x, peer.poses]))
+
+    def _cost(self, x: Array) -> float:
+        """Own cost, multipliers times residuals, penalty (10), and the pair terms."""
+        total = 0.5 * least_squares.cost(self._factors, x)
+        for peer in self._peers.values():
+            assert peer.poses is not None
+            r = least_squares.residuals(peer.between, np.concatenate([x, peer.poses]))
+            total += 0.5 * self._penalty * float((r**2).sum()) + float((peer.multipliers * r).sum())
+            if peer.pairs is not None:
+                off = self._offsets(peer, x)
+                total += 0.5 * float(np.einsum("pi,pij,pj->", off, peer.pairs.weight, off))
+        return total
+
+    def _offsets(self, peer: _Peer, x: Array) -> Array:
+        """From the neighbor's means to own ones in the common frame, [p, 3]."""
+        pairs = peer.pairs
+        assert pairs is not None
+        assert peer.poses is not None
+        there = pairs.peer_common if self.printed else _moved(peer.poses[pairs.peer_anchor], pairs.peer_mean)
+        return _moved(x[pairs.anchor], pairs.mean) - there
+
+    def _gradient(self, curvature: Array | None = None) -> Array:
+        """By own keyframes [n, 6]; adds what neighbors contribute to the curvature [n, 6, 6] to it, if it is given."""
+        n = len(self._x)
+        g, _ = least_squares.gradient(self._factors, np.ones(len(self._factors)), self._x)
+        for peer in self._peers.values():
+            assert peer.poses is not None
+            r, Ji, Jj = least_squares.linearized(peer.between, np.concatenate([self._x, peer.poses]))
+            pull = peer.multipliers + self._penalty * r
+            for slots, J in ((peer.between.i, Ji), (peer.between.j, Jj)):
+                mine = slots < n
+                J_t = np.swapaxes(J[mine], -1, -2)
+                np.add.at(g, slots[mine], (J_t @ pull[mine][..., None])[..., 0])
+                if curvature is not None:
+                    np.add.at(curvature, slots[mine], self._penalty * J_t @ J[mine])
+            if peer.pairs is not None:
+                off = self._offsets(peer, self._x)
+                R = self._x[peer.pairs.anchor, :3, :3]
+                J = np.concatenate(
+                    [np.broadcast_to(np.eye(3), R.shape), -R @ so3.hat(peer.pairs.mean)], axis=2
+                )
+                J_t = np.swapaxes(J, -1, -2)
+                weighted = peer.pairs.weight
+                np.add.at(g, peer.pairs.anchor, (J_t @ (weighted @ off[..., None]))[..., 0])
+                if curvature is not None:
+                    np.add.at(curvature, peer.pairs.anchor, J_t @ weighted @ J)
+        return g
+
+    def _gradient_step(self) -> Array:
+        """(11): along the gradient, by Armijo backtracking."""
+        g, before = self._gradient(), self._cost(self._x)
+        slope = float((g**2).sum())
+        self._length *= 4.0
+        for _ in range(HALVINGS):
+            moved = retract(self._x, -self._length * g)
+            if self._cost(moved) <= before - ARMIJO * self._length * slope:
+                return moved
+            self._length /= 2.0
+        return self._x
+
+    def _newton_step(self) -> Array:
+        n = len(self._x)
+        blocks = np.zeros((n, 6, 6))
+        g = self._gradient(blocks)
+        _, jacobians = least_squares.gradient(self._factors, np.ones(len(self._factors)), self._x)
+        tiny = 1e-9 * max(float(np.abs(blocks).max()), 1.0)
+        H = least_squares.curvature_matrix(self._factors, jacobians, np.full((n, 6), tiny))
+        H = (H + sparse.block_diag(list(blocks), format="csc")).tocsc()
+        delta = -DAMPING * least_squares.factorized(H)(g.ravel()).reshape(-1, 6)
+        turn_rad = float(np.linalg.norm(delta[:, 3:], axis=1).max())
+        return retract(self._x, delta * min(1.0, self.config.step_limit_rad / max(turn_rad, 1e-12)))
+
+    def _average(self, pairs: _Pairs | None) -> None:
+        """(12): own means become the average with the neighbor's, per dimension of the common frame."""
+        if pairs is not None:
+            T = self._x[pairs.anchor]
+            common = _moved(T, pairs.mean)
+            common = pairs.own_share * common + (1 - pairs.own_share) * pairs.peer_common
+            pairs.mean = _moved(se3.inverse(T), common)
+
+    # --- matching
+
+    def _match(self) -> None:
+        for index, peer in self._peers.items():
+            if peer.poses is None or peer.pairs is not None or self._rounds < ROUNDS_BEFORE_MATCHING:
+                continue
+            if self.own < index:
+                ids = self._matcher.matched_at(index, self._x, peer.poses)
+                if ids is not None:
+                    self._take_pairs(peer, ids)
+                    self._outbox.append((index, write_pairs(ids)))
+
+    def _take_pairs(self, peer: _Peer, ids: NDArray[np.int64]) -> None:
+        """Lay out the pair terms of ids [p, 2], the own one first."""
+        assert peer.poses is not None
+        anchor, mean, own = self._matcher.positions(self.own, ids[:, 0])
+        peer_anchor, peer_mean, other = self._matcher.positions(peer.link.index, ids[:, 1])
+        if len(ids) and (anchor.max() >= len(self._x) or peer_anchor.max() >= len(peer.poses)):
+            raise MalformedError("pairs: of a keyframe that does not exist")
+        R, Q = self._x[anchor, :3, :3], peer.poses[peer_anchor, :3, :3]
+        own, other = R @ own @ np.swapaxes(R, -1, -2), Q @ other @ np.swapaxes(Q, -1, -2)
+        a, b = (np.maximum(np.diagonal(w, axis1=1, axis2=2), 1e-9) for w in (own, other))
+        if self.printed:
+            weight = (a + b)[..., None] * np.eye(3)
+        else:
+            spread = 0.5 * SCATTER_M**2 * np.eye(3)
+            inverse = np.linalg.inv(add_covariance(own, spread) + 1e-9 * np.eye(3))
+            inverse = inverse + np.linalg.inv(add_covariance(other, spread) + 1e-9 * np.eye(3))
+            weight = np.linalg.inv(inverse) / SPLATS_PER_SAMPLE
+        common = _moved(peer.poses[peer_anchor], peer_mean)
+        peer.pairs = _Pairs(anchor, mean, peer_anchor, peer_mean, weight, a / (a + b), common)
+
+    # --- packets
+
+    def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
+        """Own keyframes of this round; as printed the matched means as well."""
+        room_bytes -= 1 + _HEAD.size
+        quats_wxyz, translations = rounded(self._x, self.config.wire)
+        packet = PosePacket(
+            sequence=self._rounds,
+            version=0,
+            keyframes=np.arange(len(self._x), dtype=np.int32),
+            quats_wxyz=quats_wxyz,
+            translations=translations,
+            penalties=np.zeros(2, np.float32),
+            curvature=None,
+            converged=self.converged,
+        )
+        head = _HEAD.pack(self._rounds)
+        parts = [POSES + head + part for part in write_poses_in_parts(packet, room_bytes, decides=False)]
+        pairs = self._peers[neighbor.index].pairs
+        if self.printed and pairs is not None:
+            common = _moved(self._x[pairs.anchor], pairs.mean)
+            parts += [MEANS + head + part for part in write_means(common, room_bytes)]
+        return parts
+
+    def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
+        """Use poses or means that are not older than the last ones."""
+        peer = self._peers[neighbor.index]
+        if len(payload) < 1 + _HEAD.size:
+            raise MalformedError("poses: cut short")
+        sent_round = _HEAD.unpack_from(payload, 1)[0]
+        if peer.poses is None or sent_round < peer.newest:
+            return
+        rest = payload[1 + _HEAD.size :]
+        if payload[:1] == POSES:
+            packet = read_poses(rest, np.arange(len(peer.poses), dtype=np.int32), from_decider=False)
+            peer.poses[packet.keyframes] = se3.from_quat_translation(
+                packet.quats_wxyz.astype(np.float64), packet.translations.astype(np.float64)
+            )
+            peer.newest = sent_round
+        elif self.printed and peer.pairs is not None:
+            first, means = read_means(rest, len(peer.pairs.mean))
+            peer.pairs.peer_common[first : first + len(means)] = means
+
+    def messages(self) -> list[tuple[int, bytes]]:
+        sent = self._outbox
+        self._outbox = []
+        return sent
+
+    def take_message(self, sender: int, payload: bytes) -> None:
+        self._arrived.append((sender, payload))
+
+    def _take_arrived(self) -> None:
+        """Keyframes and loop closures first; matches wait for the evidence."""
+        later = []
+        for sender, payload in self._arrived:
+            peer = self._peers.get(sender)
+            try:
+                if peer is None:
+                    raise MalformedError("Algorithm 1: from a robot that is not joined")
+                if peer.poses is None:
+                    self._take_setup(peer, read_setup(payload, len(self._x)))
+                elif not self._matcher.is_here(sender):
+                    later.append((sender, payload))
+                elif self.own > sender and peer.pairs is None:
+                    self._take_pairs(peer, read_pairs(payload)[:, ::-1])
+            except ValueError as error:
+                self.refused.append(str(error))
+        self._arrived = later
+
+    def _take_setup(self, peer: _Peer, setup: Setup) -> None:
+        kept = [c for c, keep in zip(peer.link.closures, peer.link.keep.tolist(), strict=True) if keep]
+        closures: list[LoopClosure] = [*kept, *(c.reversed() for c in setup.closures)]
+        own = [c.own_keyframe for c in closures]
+        slots = len(self._x) + np.array([c.peer_keyframe for c in closures], dtype=np.int64)
+        if any(c.peer_keyframe >= len(setup.poses) for c in closures):
+            raise MalformedError("Algorithm 1: a loop closure of a keyframe that does not exist")
+        peer.between = closures_as_relative_poses(closures, own, slots, self.config.closures)
+        peer.multipliers = np.zeros((len(closures), 6))
+        peer.poses = setup.poses.copy()
+
+    # --- results
+
+    @property
+    def T_world_keyframe(self) -> Array:  # noqa: N802 (a transform)
+        return self._x.copy()
+
+    @property
+    def converged(self) -> bool:
+        """All is known, and nothing moves; as printed, all loop closures hold as well."""
+        known = all(peer.poses is not None and peer.pairs is not None for peer in self._peers.values())
+        return known and self._still >= STILL_ROUNDS and (not self.printed or self._primal() < PRIMAL)
+
+    def _primal(self) -> float:
+        """Largest residual of a loop closure, not whitened."""
+        largest = 0.0
+        for peer in self._peers.values():
+            if peer.poses is not None and len(peer.between):
+                r = np.linalg.solve(peer.between.whitening, self._residuals(peer)[..., None])
+                largest = max(largest, float(np.abs(r).max()))
+        return largest
+
+    @property
+    def largest_change(self) -> float:
+        return self._step
+
+    def weights(self, peer: str) -> Array:
+        """There are no robust weights: what the links began with counts."""
+        link = next(p.link for p in self._peers.values() if p.link.name == peer)
+        return link.keep.astype(np.float64)
+
+    @property
+    def loop_weights(self) -> Array:
+        return self._loops.copy()
+
+    def refuted(self, peer: str) -> bool:
+        """Never."""
+        return False
+
+    def residuals(self) -> dict[str, Any]:
+        names = [peer.link.name for peer in self._peers.values()]
+        ready = all(peer.poses is not None for peer in self._peers.values())
+        return {
+            "primal": self._primal(),
+            "dual": max(
+                [float(np.abs(p.multipliers).max(initial=0.0)) for p in self._peers.values()] or [0.0]
+            ),
+            "cost": self._cost(self._x) if ready else 0.0,
+            "step": self._step,
+            "penalties": dict.fromkeys(names, (self._penalty, self._penalty)),
+            "versions": dict.fromkeys(names, 0),
+            "weights": {
+                p.link.name: p.link.keep.astype(float).tolist()
+                for p in self._peers.values()
+                if p.link.closures
+            },
+            "factorizations": 0,
+        }
+
+
+def _moved(T: Array, points: Array) -> Array:
+    """Points [p, 3] by one motion [p, 4, 4] each."""
+    return (T[:, :3, :3] @ points[..., None])[..., 0] + T[:, :3, 3]
