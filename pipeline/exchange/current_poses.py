@@ -1,8 +1,9 @@
 """Poses that are not final yet, flooded so that a contact may end at any time.
 
 Evidence hangs on keyframes: without their poses nothing of it can be used. Final poses come when the whole component
-has converged, which may be after the robots have lost each other. So every robot floods its poses when the solver
-starts, and again when they have moved. They count only where final ones have not arrived.
+has converged, which may be after the robots have lost each other. So every robot tells its neighbors where its
+keyframes lie from its first one, as soon as they meet, and floods its poses when the solver starts, and again when they
+have moved. They count only where final ones have not arrived.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.wire import state_wire
 from duagc.pipeline.exchange.wire.state_wire import Anchors
@@ -22,6 +24,8 @@ MOVED = 1e-3
 """Change of a coordinate of a keyframe (m, or of its rotation matrix) for which its poses are sent again."""
 LEAST_ROUNDS = 8
 """Between two versions."""
+FROM_FIRST = 0
+"""Instead of a round: poses as seen from the first keyframe, which the receiver places. No solver starts in round 0."""
 _VERSION = struct.Struct("<I")
 
 
@@ -54,6 +58,22 @@ class CurrentPoses:
         """
         self.own, self.team = own, team
         self._newest: dict[int, _Version] = {}
+        self._from_first: dict[int, Anchors] = {}
+
+    def tell(self, send: Callable[[Neighbor, Kind, bytes], int], n: Neighbor, poses: Anchors) -> None:
+        """Tell a neighbor once where own keyframes lie as seen from the first.
+
+        Args:
+            send: queues a message and returns its id.
+            n: the neighbor.
+            poses: own ones, the first keyframe at the origin.
+        """
+        if self.own not in n.passed.current:
+            payload = _VERSION.pack(FROM_FIRST) + state_wire.write_anchors(poses)
+            n.passed.current[self.own] = (
+                FROM_FIRST,
+                send(n, Kind.CURRENT_POSES, state_wire.write_labeled(0, self.team, payload)),
+            )
 
     def offer(self, poses: Anchors, revoked: int, round_index: int) -> None:
         """Own poses of this round; they become a new version where they have moved.
@@ -89,6 +109,11 @@ class CurrentPoses:
         if poses.owner == self.own:
             raise MalformedError("current poses: a neighbor speaks for this robot")
         version = _Version(_VERSION.unpack_from(rest)[0], revoked, poses, payload)
+        if version.round == FROM_FIRST:
+            if poses.owner != n.index:
+                raise MalformedError("current poses: a neighbor speaks for another robot")
+            self._from_first[poses.owner] = poses
+            return
         known = self._newest.get(poses.owner)
         if known is None or version.round > known.round:
             self._newest[poses.owner] = version
@@ -115,10 +140,19 @@ class CurrentPoses:
                     message = send(n, Kind.CURRENT_POSES, version.payload)
                     n.passed.current[owner] = version.round, message
 
-    def known(self, revoked: int) -> dict[int, Anchors]:
-        """The newest poses by owner, of those that were sought without these links.
+    def known(
+        self, revoked: int, members: Sequence[int], T_world_first: Callable[[int], Array]
+    ) -> dict[int, Anchors]:
+        """The newest poses by owner, of those that were sought without these links; else from its first keyframe.
 
         Args:
             revoked: links that do not count.
+            members: robots of the component.
+            T_world_first: where the first keyframe of a member was placed, [4, 4].
         """
-        return {owner: v.poses for owner, v in sorted(self._newest.items()) if v.revoked == revoked}
+        placed = {
+            owner: Anchors(owner, T_world_first(owner) @ poses.T_common_keyframe, poses.T_map_first)
+            for owner, poses in sorted(self._from_first.items())
+            if owner in members
+        }
+        return placed | {o: v.poses for o, v in sorted(self._newest.items()) if v.revoked == revoked}

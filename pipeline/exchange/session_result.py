@@ -27,11 +27,11 @@ def result_of(agent: MapAgent) -> SessionResult:
     gauge = np.eye(4)
     others: list[int] = []
     placed = _placed(agent)
-    if agent.poses is not None:
+    if placed:
         others = agent.others
         T_common = {team[i]: poses.T_common_keyframe for i, poses in sorted(placed.items())}
         gauge = _gauge(placed.get(agent.alignment.root))
-    T_world = {name: gauge @ T for name, T in T_common.items()} if agent.poses is not None else T_common
+    T_world = {name: gauge @ T for name, T in T_common.items()} if placed else T_common
     names = [robot, *(team[i] for i in others)]
     own = agent.evidence.own_records()
     evidence = {team[i]: knowledge.sound_records(placed[i]) for i in others if i in placed}
@@ -67,10 +67,14 @@ def _active(agent: MapAgent, pairs: PairList) -> bool:
 
 def _placed(agent: MapAgent) -> dict[int, Anchors]:
     """Poses by owner: the final ones as far as they have arrived, else the newest ones."""
-    if agent.poses is None:
+    alignment = agent.alignment
+    if agent.poses is None and (not agent.others or alignment.undecided):
         return {}
-    own = Anchors(agent.own, agent.poses.T_world_keyframe, agent.graph.T_map_keyframe[0])
-    newest = agent.evidence.current.known(agent.alignment.revoked)
+    T_own = alignment.T_world_first(agent.own) @ agent.graph.T_first_keyframe
+    if agent.poses is not None:
+        T_own = agent.poses.T_world_keyframe
+    own = Anchors(agent.own, T_own, agent.graph.T_map_keyframe[0])
+    newest = agent.evidence.current.known(alignment.revoked, alignment.members, alignment.T_world_first)
     return {**newest, agent.own: own, **agent.knowledge.anchors}
 
 

@@ -28,6 +28,7 @@ from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.solvers import Matcher
 from duagc.pipeline.exchange.wire import evidence_wire, state_wire
 from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList, State
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.network.transport import Arrival
 from duagc.pipeline.runs.robot_data import RobotData
@@ -309,10 +310,17 @@ class Sharing:
             send: queues a message.
             n: the neighbor, which is not joined.
         """
+        if n.loop_closing is not None:
+            self.current.tell(send, n, self._from_first())
         if n.loop_closing is not None and n.loop_closing.promising:
             self._send_evidence(send, n, [self.own], None)
         elif n.decided and self.own in n.passed.evidence:
             n.transport.cancel(n.passed.evidence.pop(self.own))
+
+    def _from_first(self) -> Anchors:
+        """Own keyframes as seen from the first."""
+        T_map_keyframe = self.data.T_map_keyframe
+        return Anchors(self.own, se3.inverse(T_map_keyframe[0]) @ T_map_keyframe, T_map_keyframe[0])
 
     def _send_evidence(
         self, send: SendTo, n: Neighbor, members: Sequence[int], T_world_map: Array | None
