@@ -310,7 +310,7 @@ class Sharing:
             send: queues a message.
             n: the neighbor, which is not joined.
         """
-        if n.loop_closing is not None:
+        if n.loop_closing is not None and self.data.keyframes:
             self.current.tell(send, n, self._from_first())
         if n.loop_closing is not None and n.loop_closing.promising:
             self._send_evidence(send, n, [self.own], None)
