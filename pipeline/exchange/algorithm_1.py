@@ -272,7 +272,9 @@ class Algorithm1Solver:
             inverse = inverse + np.linalg.inv(add_covariance(other, spread) + 1e-9 * np.eye(3))
             weight = np.linalg.inv(inverse) / SPLATS_PER_SAMPLE
         common = _moved(peer.poses[peer_anchor], peer_mean)
-        peer.pairs = _Pairs(anchor, mean, peer_anchor, peer_mean, weight, a / (a + b), common)
+        peer.pairs = _Pairs(
+            anchor, mean, peer_anchor, peer_mean, weight=weight, own_share=a / (a + b), peer_common=common
+        )
 
     # --- packets
 

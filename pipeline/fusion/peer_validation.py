@@ -135,7 +135,7 @@ def validate_peer_maps(
         possible = _sizes_m(peers[name]) <= largest_m
         peer, too_large[name] = peers[name].select(possible), int(np.sum(~possible))
         near = _near(own, peer, _between(pairs, own.owner, name), radius_m)
-        judged[name] = _PhotometricCheck(views, context, depth_kinds[name], config, arrived[name])
+        judged[name] = _PhotometricCheck(views, context, depth_kinds[name], config, arrived=arrived[name])
         against = judged[name].contradicted(_in_colors_of(own, peer, near, matching), own_colors.variance)
         used = slice(None) if judged[name].trusted(own_colors.pixels) else slice(0, 0)
         world[name], contradicted[name] = peer.select(used), against[used]
@@ -264,6 +264,7 @@ class _PhotometricCheck:
         context: MapContext,
         depth_kind: DepthKind,
         config: PeerValidationConfig,
+        *,
         arrived: float,
     ) -> None:
         self.explained = config.min_explained_variance * arrived
