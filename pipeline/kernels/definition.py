@@ -131,7 +131,7 @@ def linearized(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
 
 def paint(pixels: Any, screen: Screen, background: Any, closing: float = 0.0) -> Painting:
     """Color, depth and alpha of pixels [m, 2]; `closing`: see `blend`."""
-    weights, gates = blend(pixels, screen.centers, screen.conics, screen.opacities, closing)
+    weights, gates = blend(pixels, screen.centers, screen.conics, screen.opacities, closing=closing)
     total = weights.sum(-1)
     color = (weights[..., None] * screen.colors).sum(-2) + (1 - total)[:, None] * background
     along_ray = screen.depths + (screen.slopes * (pixels[:, None] - screen.centers)).sum(-1)
@@ -139,7 +139,7 @@ def paint(pixels: Any, screen: Screen, background: Any, closing: float = 0.0) ->
 
 
 def blend(
-    pixels: Any, centers: Any, conics: Any, opacities: Any, closing: float = 0.0
+    pixels: Any, centers: Any, conics: Any, opacities: Any, *, closing: float = 0.0
 ) -> tuple[Any, tuple[Any, Any]]:
     """Blending weights [m, k] of k Gaussians, nearest first, at pixels [m, 2].
 
