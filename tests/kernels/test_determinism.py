@@ -61,15 +61,15 @@ def digest(rasterizer: Rasterizer, count: int = FEW) -> str:
             depth_certainty=color[..., 0].copy(),
         )
         arrays += [a for a in vars(of_surface).values() if a is not None]
-        _, closed_early = rasterizer.view_gradients(
-            *view, color=color, depth_m=depth_m, loss=SURFACE, mask=mask, depth_kind=depth, closing=0.05
-        )
-        arrays += [a for a in vars(closed_early).values() if a is not None]
         statistics = rasterizer.statistics()
         arrays += [a for a in vars(gradients).values() if a is not None]
         arrays += [np.array([loss.value, loss.color, loss.depth, *loss.d_exposure])]
         arrays += [np.array([statistics.visible, statistics.intersections])]
         arrays += [np.array([statistics.evaluated_pairs, statistics.blended_pairs])]
+        _, closed_early = rasterizer.view_gradients(
+            *view, color=color, depth_m=depth_m, loss=SURFACE, mask=mask, depth_kind=depth, closing=0.05
+        )
+        arrays += [a for a in vars(closed_early).values() if a is not None]
     assert len(arrays) == 2 * 41
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
