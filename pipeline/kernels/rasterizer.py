@@ -82,6 +82,7 @@ class Rasterizer:
         self.threads = int(threads)
         self._raster = _raster.Raster(isa)
         self._gaussians: Gaussians | None = None
+        self._closed_early = False
         self._size = (0, 0)
 
     @property
@@ -150,7 +151,7 @@ class Rasterizer:
         over Gaussians of blending weight times the Huber loss of the Gaussian's depth at the pixel minus the measured
         one. The blended depth may be right because what lies in front and behind cancels; this one may not.
 
-        `fisher` and the others may follow as after a `forward`, but not where `closing` drew another image.
+        `fisher` and the others may follow as after a `forward`; where `closing` drew another image, only `visible`.
 
         Args:
             gaussians: as in `forward`.
@@ -195,8 +196,7 @@ class Rasterizer:
         self._gaussians = None
         refuse_bad_image(status, {"color": NOT_FINITE, "depth_m": NEGATIVE, "depth_certainty": NEGATIVE})
         self._finish(gaussians, (height, width), status)
-        if closing > TRANSMITTANCE_MIN:
-            self._gaussians = None
+        self._closed_early = closing > TRANSMITTANCE_MIN
         of_color, of_depth, missing, by_gain, by_offset, surface = (float(value) for value in values)
         value = (
             of_color
@@ -241,7 +241,7 @@ class Rasterizer:
             raise ValueError(
                 f"gaussians: {len(gaussians)} are so large on the screen that their tiles do not fit into memory"
             )
-        self._gaussians, self._size = gaussians, size
+        self._gaussians, self._size, self._closed_early = gaussians, size, False
 
     def backward(
         self,
@@ -377,8 +377,8 @@ class Rasterizer:
 
     @property
     def visible(self) -> int:
-        """Gaussians on the screen in the last view; `statistics` gives more, and takes longer."""
-        self._last_forward()
+        """Gaussians on the screen in the last view, also if it was closed early; `statistics` takes longer."""
+        self._drawn()
         return self._raster.visible
 
     def statistics(self) -> Statistics:
@@ -390,6 +390,11 @@ class Rasterizer:
         )
 
     def _last_forward(self) -> tuple[Gaussians, tuple[int, int]]:
+        if self._closed_early:
+            raise RuntimeError("the last view was closed early, expected one that forward has drawn")
+        return self._drawn()
+
+    def _drawn(self) -> tuple[Gaussians, tuple[int, int]]:
         if self._gaussians is None:
             raise RuntimeError("forward has not drawn anything yet")
         return self._gaussians, self._size

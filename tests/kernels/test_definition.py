@@ -546,8 +546,12 @@ def test_a_view_that_was_closed_early_cannot_be_asked_further(plain):
     rasterizer = Rasterizer()
     view = plain.gaussians, plain.camera, plain.T_camera_map
     rasterizer.view_gradients(*view, color=color, depth_m=depth_m, loss=LOSS, closing=0.2)
-    with pytest.raises(RuntimeError, match="forward"):
+    with pytest.raises(RuntimeError, match="closed early"):
         rasterizer.contributions()
+    visible = rasterizer.visible
+    rasterizer.forward(*view)
+    assert rasterizer.visible == visible > 0
+    rasterizer.contributions()
 
 
 def test_derivatives_by_exposure_are_differences(rasterizer, plain):
