@@ -44,6 +44,9 @@ from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import smoothstep_decay
 from duagc.pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
+MANY_VIEWS = 16
+"""Views from which on every second one tells what a Gaussian contributes to all."""
+
 
 @dataclass(frozen=True)
 class MappingStats:
@@ -277,7 +280,8 @@ class Mapper:
                 )
             if step in rounds:
                 number = rounds.index(step)
-                pruned += self._prune_useless(views[number % 2 :: 2], len(views))
+                half = views[number % 2 :: 2] if len(views) >= MANY_VIEWS else views
+                pruned += self._prune_useless(half, len(views))
                 inserted += self._densify(1.0 / (len(rounds) - number))
             elif step == steps // 2:
                 pruned += self._prune_useless(views, len(views))

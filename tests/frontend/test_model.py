@@ -5,6 +5,7 @@ import pytest
 
 from duagc.pipeline.config.frontend import ModelConfig
 from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import SparseStepsConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.mapping import Mapper
 from duagc.pipeline.frontend.model_registration import ModelTracker
@@ -30,7 +31,12 @@ def image(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def gaussians() -> Gaussians:
     """The room from three places; the map frame is the keyframe's camera."""
-    config = MappingConfig(max_gaussians=20000, iterations=20, final_iterations=30, pose_rate=0.0)
+    whole = SparseStepsConfig(
+        until=0.0
+    )  # what is tested is the registration: the map is to be good in few steps
+    config = MappingConfig(
+        max_gaussians=20000, iterations=20, final_iterations=30, pose_rate=0.0, sparse=whole
+    )
     mapper = Mapper(CAMERA, config, seed=0, depth_noise_m=0.005)
     for k, T in enumerate((KEYFRAME, pose(x=-0.1, z=-0.9), pose(x=0.12, z=-0.85, yaw=0.05))):
         mapper.add_keyframe(k, *image(T), se3.inverse(KEYFRAME) @ T)
