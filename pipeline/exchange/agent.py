@@ -39,13 +39,13 @@ from duagc.pipeline.exchange.map_alignment import MapAlignment
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.radio import Radio
-from duagc.pipeline.exchange.sharing import SharedData
+from duagc.pipeline.exchange.shared_data import SharedData
 from duagc.pipeline.exchange.solvers import LinkStart, PoseSolver, SolverFactory, SolverStart, solver_of
 from duagc.pipeline.exchange.wire import state_wire
 from duagc.pipeline.exchange.wire.state_wire import RelativeFrames, State, pair_bit
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.network.messages import Arrival, Message, Outgoing
 from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError
-from duagc.pipeline.network.transport import Arrival, Message, Outgoing
 
 WHOLE_COMPONENT = 255  # a hop count that has reached the whole component, for good
 MAX_EARLY_MESSAGES = 64

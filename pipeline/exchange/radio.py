@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from duagc.pipeline.config.network import TransportConfig
 from duagc.pipeline.exchange.loop_closing import LoopClosing, Send
 from duagc.pipeline.exchange.neighbor import Neighbor
+from duagc.pipeline.network.messages import Arrival, Message
 from duagc.pipeline.network.packets import Kind, MalformedError, Packet, parse
 from duagc.pipeline.network.signatures import Identity
-from duagc.pipeline.network.transport import Arrival, Message, Transport
+from duagc.pipeline.network.transport import Transport
 
 
 class Radio:

@@ -15,6 +15,7 @@ from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.messages import map_frame, pack_pose, pack_stamp
 from duagc.pipeline.messages.parts import pack_information
 from duagc.pipeline.network.link_model import Fate
+from duagc.pipeline.network.messages import Outgoing
 from duagc.pipeline.network.packets import (
     EVIDENCE_KINDS,
     HEADER_BYTES,
@@ -23,7 +24,6 @@ from duagc.pipeline.network.packets import (
     parse,
     payload_bytes,
 )
-from duagc.pipeline.network.transport import Outgoing
 from duagc.pipeline.recording import LogWriter, read_log
 from duagc.pipeline.runs.robot_data import RobotData, SessionResult
 from duagc.schemas import topics

@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.exchange.agent import Agent
 from duagc.pipeline.network.link_model import Fate, LinkModel
-from duagc.pipeline.network.transport import Outgoing
+from duagc.pipeline.network.messages import Outgoing
 
 AnyAgent = TypeVar("AnyAgent", bound=Agent)
 AgentSeen = TypeVar("AgentSeen", bound=Agent, contravariant=True)

@@ -18,7 +18,7 @@ from duagc.pipeline.exchange.session_result import result_of
 from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM
 from duagc.pipeline.network import link_model
 from duagc.pipeline.network.link_model import Fate, LinkModel
-from duagc.pipeline.network.transport import Outgoing
+from duagc.pipeline.network.messages import Outgoing
 from duagc.pipeline.recording import LogWriter
 from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 

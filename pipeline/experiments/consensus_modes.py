@@ -34,8 +34,9 @@ from duagc.pipeline.experiments.gaussian_consensus import (
     total_weights,
 )
 from duagc.pipeline.network.link_model import LinkModel, neighbors
+from duagc.pipeline.network.messages import Message
 from duagc.pipeline.network.packets import EVIDENCE_HEAD_BYTES, HEADER_BYTES, MAX_PAYLOAD_BYTES, Kind, parse
-from duagc.pipeline.network.transport import Message, Transport
+from duagc.pipeline.network.transport import Transport
 from duagc.pipeline.splat.information import pack_information
 
 PERIOD_NS = 100_000_000

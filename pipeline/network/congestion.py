@@ -219,9 +219,9 @@ class SendRate:
         sent_bytes: int,
         left_bytes: int,
         most_bytes: int,
-        *,
-        wait_rounds: int,
         round_index: int,
+        *,
+        round_trip: int,
         more: bool,
     ) -> None:
         """The packets of a round are known: where more would have been sent, perhaps try for more.
@@ -230,10 +230,13 @@ class SendRate:
             sent_bytes: in this round.
             left_bytes: of the budget.
             most_bytes: that may be sent in any round.
-            wait_rounds: after which the receiver would have said that the link is full.
             round_index: the current round.
+            round_trip: rounds there and back when nothing waits.
             more: something had to wait.
         """
+        wait_rounds = (
+            round_trip + FULL_ROUNDS + WINDOW_ROUNDS
+        )  # after which a report of the last try would be here
         self._queued = 0.0 if self.limit is None else max(0.0, self._queued + sent_bytes - self.limit)
         self._left = float(min(left_bytes, MAX_PACKET_BYTES)) if more else 0.0
         if (

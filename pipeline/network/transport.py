@@ -20,11 +20,11 @@ from duagc.pipeline.config.network import TransportConfig
 from duagc.pipeline.network.congestion import (
     FULL_ROUNDS,
     MOST_ROUNDS,
-    WINDOW_ROUNDS,
     Congestion,
     LinkObserver,
     SendRate,
 )
+from duagc.pipeline.network.messages import Arrival, Message, Outgoing
 from duagc.pipeline.network.packets import (
     EVIDENCE_KINDS,
     HEADER_BYTES,
@@ -49,55 +49,6 @@ LAST_CHUNKS = 3
 LOSSY = 0.97  # share of packets heard below which a link loses some
 SEQUENCE_BLOCK = 1024
 ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
-
-
-@dataclass(frozen=True)
-class Message:
-    """A message to send.
-
-    Attributes:
-        id: unique for its sender.
-        kind: of its content.
-        payload: its bytes.
-    """
-
-    id: int
-    kind: Kind
-    payload: bytes
-
-
-@dataclass(frozen=True)
-class Outgoing:
-    """One packet to send.
-
-    Attributes:
-        receiver: name of the robot that it is for.
-        sequence: its number on this directed link.
-        packet: its bytes.
-        message: what it is cut from.
-    """
-
-    receiver: str
-    sequence: int
-    packet: bytes
-    message: Message
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """What a delivered packet brought.
-
-    Attributes:
-        kind: of the message.
-        message: its id.
-        payload: of the message, or of a chunk of evidence.
-        complete: it is a message, not a chunk.
-    """
-
-    kind: Kind
-    message: int
-    payload: bytes
-    complete: bool
 
 
 @dataclass
@@ -236,15 +187,8 @@ class Transport:
                 after_rounds = self._retransmit_after(entry.message.kind) + self._rate.queued_rounds
                 entry.due_round[chunk] = round_index + after_rounds
                 out.append(self._packet(entry.message, chunk, round_index))
-        wait_rounds = self._round_trip + FULL_ROUNDS + WINDOW_ROUNDS
-        self._rate.sent(
-            sum(len(o.packet) for o in out),
-            budget_bytes,
-            most_bytes,
-            wait_rounds=wait_rounds,
-            round_index=round_index,
-            more=more,
-        )
+        sent_bytes, trip = sum(len(o.packet) for o in out), self._round_trip
+        self._rate.sent(sent_bytes, budget_bytes, most_bytes, round_index, round_trip=trip, more=more)
         return out
 
     @property

@@ -11,7 +11,7 @@ from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.exchange.rounds import run_rounds
 from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM
 from duagc.pipeline.network.link_model import Fate, LinkModel
-from duagc.pipeline.network.transport import Outgoing
+from duagc.pipeline.network.messages import Outgoing
 from duagc.pipeline.posegraph.files import TeamGraph
 from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
 

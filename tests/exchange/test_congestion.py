@@ -16,8 +16,9 @@ from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.congestion import MOST_ROUNDS, Congestion, SendRate
 from duagc.pipeline.network.link_model import LinkModel
+from duagc.pipeline.network.messages import Message
 from duagc.pipeline.network.packets import Kind, parse
-from duagc.pipeline.network.transport import Message, Transport
+from duagc.pipeline.network.transport import Transport
 from tests.fixtures.results import same
 
 PERIOD_NS = 100_000_000
@@ -90,7 +91,7 @@ def test_a_link_that_becomes_fast_is_used_again() -> None:
     for now in range(300):
         budget = rate.budget(BUDGET_BYTES, now)
         assert (budget == BUDGET_BYTES) == (rate.limit is None)
-        rate.sent(budget, 0, BUDGET_BYTES, wait_rounds=9, round_index=now, more=True)
+        rate.sent(budget, 0, BUDGET_BYTES, now, round_trip=4, more=True)
     assert rate.limit is None
 
 

@@ -8,8 +8,9 @@ import pytest
 
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
 from duagc.pipeline.network.link_model import LinkModel
+from duagc.pipeline.network.messages import Message
 from duagc.pipeline.network.packets import Kind, MalformedError, Packet, parse
-from duagc.pipeline.network.transport import Message, Transport
+from duagc.pipeline.network.transport import Transport
 
 
 def two_ends(config: TransportConfig | None = None) -> tuple[Transport, Transport]:
