@@ -6,12 +6,12 @@ the distances of matched Gaussians in the common frame.
 
     printed    one Riemannian gradient step with Armijo backtracking (11) on the augmented Lagrangian (10); loop
                closures are constraints with multipliers (14), whose residual is that of the measured relative pose,
-               because the printed one vanishes for no measurement but the identity; a pair weighs the sum of both
-               informations (8); then own matched means become the average with the neighbor's last ones, by
+               because the printed one vanishes for no measurement but the identity; a pair weighs the sum of the
+               information of both (8); then own matched means become the average with the neighbor's last ones, by
                information and dimension (12), and are sent with the poses.
     corrected  one damped Gauss-Newton step on the same terms without multipliers; a pair weighs the parallel sum of
-               both informations, with the scatter of matched Gaussians, and for as many as share a pixel once; means
-               stay what each robot saw. Its fixed point is the minimum over all poses and all matched means.
+               the information of both, with the scatter of matched Gaussians, and for as many as share a pixel once;
+               means stay what each robot saw. Its fixed point is the minimum over all poses and all matched means.
 
 Of a Gaussian only its mean acts on poses; covariances and colors (13) are averaged by fusion, at the final poses.
 The lower-named robot of a pair matches once, when the evidence is here.

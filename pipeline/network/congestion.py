@@ -1,13 +1,12 @@
 """How much a link takes, by what its two ends see of each other: delays in rounds, sequence numbers, nothing else.
 
 The receiver knows from every packet the round in which it was sent. Where even the fastest of the last packets took
-rounds longer than the fastest ever, packets wait in the sender's queue: the link is full. It then tells the sender by
-how many rounds, and how many bytes a round the link carries. That is not what arrives: packets lost on the link were
-carried as well. Their share follows from the gaps between packets of one burst, because a full queue drops the end of
-a burst and loss drops any part of it. Loss alone, of whatever share, delays nothing
-and therefore slows nothing down.
+rounds longer than the fastest ever, packets wait in the sender's queue: the link is full. It then reports by how many
+rounds, and how many bytes a round the link carries. That is not what arrives: packets lost on the link were carried as
+well. Their share follows from the gaps between packets of one burst, because a full queue drops the end of a burst and
+loss drops any part of it. Loss alone, of whatever share, delays nothing and therefore slows nothing down.
 
-The sender then lets the queue run empty, goes on at the rate that it was told, and tries for more as long as nothing is
+The sender then lets the queue run empty, goes on at the reported rate, and tries for more as long as nothing is
 delayed. A link on which nothing waits causes no report and has no limit.
 """
 
@@ -22,7 +21,7 @@ from duagc.pipeline.network.packets import MAX_PACKET_BYTES
 FULL_ROUNDS = 2
 """Excess delay from which a link counts as full. At a rate that just fits, the end of a burst is one round late."""
 WINDOW_ROUNDS, MOST_WINDOW_ROUNDS = 3, 12
-MOST_ROUNDS = 32  # that a sender pauses or holds, whatever it is told
+MOST_ROUNDS = 32  # that a sender pauses or holds, whatever is reported
 LEAST_HEARD = 8  # packets in the window; it is as long as it takes to hear them, or says nothing
 LEAST_BUDGET_BYTES = 2_400  # acknowledgements and states always go
 DECREASE = 0.9
@@ -93,7 +92,7 @@ class LinkObserver:
         train.heard += 1
 
     def congestion(self, round_index: int) -> Congestion | None:
-        """What to tell the sender; None if its packets do not wait, or too few were heard.
+        """What to report to the sender; None if its packets do not wait, or too few were heard.
 
         Args:
             round_index: the current round.
@@ -198,7 +197,7 @@ class SendRate:
 
     @property
     def queued_rounds(self) -> int:
-        """Rounds that the next packet will wait, as far as this end can tell."""
+        """Rounds that the next packet will wait, as far as this end knows."""
         return 0 if self.limit is None else int(self._queued / self.limit)
 
     def budget(self, most_bytes: int, round_index: int) -> int:

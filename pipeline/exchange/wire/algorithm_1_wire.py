@@ -33,7 +33,7 @@ _MEAN_BYTES = 12
 
 @dataclass(frozen=True)
 class Setup:
-    """What a robot tells a neighbor at the start.
+    """What a robot sends a neighbor at the start.
 
     Attributes:
         poses: [n, 4, 4], its keyframes in the common frame.
