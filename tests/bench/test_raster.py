@@ -141,4 +141,4 @@ def test_command_refuses_by_option(option, value, complaint):
 
 
 def test_counts_with_units():
-    assert cli.bench._counts("--gaussians", "60k,1M,7") == [60_000, 1_000_000, 7]
+    assert cli.bench.counts("--gaussians", "60k,1M,7") == [60_000, 1_000_000, 7]
