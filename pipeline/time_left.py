@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from duagc.pipeline.base.machine import cores, processors
+from duagc.pipeline.base.machine import processors
 from duagc.pipeline.cache import durations
 from duagc.pipeline.cache.durations import Size
 from duagc.pipeline.config.mapping import MappingConfig
@@ -92,11 +92,11 @@ class TimeLeft:
 
     def _units(self, sizes: Sequence[Size], wanted: Sequence[stages.Stage]) -> list[tuple[str, float]]:
         """What follows the front ends, in order: stages, and predicted seconds; fusion robot by robot."""
-        slower = durations.slowdown(self._workers, cores())
+        slower = durations.slowdown(self._workers, processors())
         evaluated = durations.side_by_side_s(
             (), [durations.evaluation_s(s, len(sizes)) for s in sizes], self._workers
         )
-        alone_s = [durations.threaded_s(durations.fusion_s(s), cores(), processors()) for s in sizes]
+        alone_s = [durations.threaded_s(durations.fusion_s(s), processors()) for s in sizes]
         fused = [(stages.FUSION, seconds) for seconds in alone_s] if len(sizes) > 1 else []
         expected = [
             (stages.EXCHANGE, durations.exchange_s(len(sizes))),
@@ -162,7 +162,7 @@ class TimeLeft:
         with self._lock:
             now, rate = self._clock(), self._rate()
             begun, waiting = list[float](), list[float]()
-            slower = durations.slowdown(self._workers, cores())
+            slower = durations.slowdown(self._workers, processors())
             for work in self.robots.values():
                 if work.took_s is not None:
                     continue
@@ -201,7 +201,7 @@ class TimeLeft:
             if work.began_s is not None:
                 measured += work.took_s if work.took_s is not None else now - work.began_s
                 done = self._done(work) if work.took_s is None else self._whole(work)
-                predicted += durations.slowdown(self._workers, cores()) * (done - work.earlier_s)
+                predicted += durations.slowdown(self._workers, processors()) * (done - work.earlier_s)
         return (TRUSTED_S + measured) / (TRUSTED_S + predicted)
 
     def _rate_of(self, stage: str, rate: float) -> float:

@@ -36,7 +36,7 @@ class Simulated:
         keyframes, steps = self.sizes[robot]["frames"] // 20, []
         size = {**self.sizes[robot], "keyframes": keyframes}
         at = begin
-        inflation = self.slower * durations.slowdown(self.workers, machine.cores())
+        inflation = self.slower * durations.slowdown(self.workers, machine.processors())
         for part, seconds in durations.front_end_parts(size, MAPPING).items():
             took = seconds * inflation * next(self.uneven)
             if part == "poses":

@@ -29,14 +29,3 @@ def memory_bytes() -> tuple[int | None, int | None]:
 def processors() -> int:
     """Processors that this process may use; every thread of a core is one."""
     return len(os.sched_getaffinity(0))
-
-
-def cores() -> int:
-    """Cores that this process may use; the threads of one core count once."""
-    usable = os.sched_getaffinity(0)
-    siblings = set()
-    for processor in usable:
-        with suppress(OSError):
-            topology = Path(f"/sys/devices/system/cpu/cpu{processor}/topology")
-            siblings.add((topology / "thread_siblings_list").read_text().strip())
-    return len(siblings) or len(usable)

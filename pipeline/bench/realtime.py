@@ -2,7 +2,7 @@
 
 Processor time counts all processes of a stage together, and all robots' seconds of log; wall time is that of the whole
 command, per second of the longest log: below 1 a team is mapped faster than it recorded. Open3D's odometry, which only
-tracks, stands beside it.
+tracks, is a row of its own.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class RealtimePlan:
         recording: of a team.
         robots: sizes of the teams; the first robots by name.
         threads: processors that a run may use.
-        beside: `duagc` of another version, that runs the same; None: there is none.
+        other: `duagc` of another version, that runs the same; None: there is none.
         open3d: whether Open3D's odometry is measured, on the first robot.
         seconds: of every log; None: all of it.
         options: more words for `duagc run`.
@@ -52,14 +52,14 @@ class RealtimePlan:
     recording: Path
     robots: tuple[int, ...]
     threads: tuple[int, ...]
-    beside: Path | None = None
+    other: Path | None = None
     open3d: bool = True
     seconds: float | None = None
     options: tuple[str, ...] = ()
 
     def versions(self) -> dict[str, Sequence[str]]:
         """Commands by name."""
-        return {"this": THIS} | ({} if self.beside is None else {"beside": (str(self.beside),)})
+        return {"this": THIS} | ({} if self.other is None else {"other": (str(self.other),)})
 
 
 def run(plan: RealtimePlan) -> dict[str, Any]:
@@ -74,8 +74,8 @@ def run(plan: RealtimePlan) -> dict[str, Any]:
     from duagc.pipeline.bench.raster import cpu_name
 
     source = Recording(plan.recording)
-    if plan.beside is not None and not os.access(plan.beside, os.X_OK):
-        raise DuagError(f"{plan.beside}: no such command, expected `duagc` of another version")
+    if plan.other is not None and not os.access(plan.other, os.X_OK):
+        raise DuagError(f"{plan.other}: no such command, expected `duagc` of another version")
     if max(plan.robots) > len(source.robots):
         raise DuagError(
             f"{plan.recording}: has {len(source.robots)} robots, expected {max(plan.robots)} or more"
@@ -156,7 +156,7 @@ def _open3d(recording: Recording) -> dict[str, Any]:
 
 
 def format_table(result: dict[str, Any]) -> str:
-    """The rows as a table in Markdown, with ratios of this version to the one beside it.
+    """The rows as a table in Markdown, with ratios of this version to the other one.
 
     Args:
         result: of `run`.
@@ -170,9 +170,9 @@ def format_table(result: dict[str, Any]) -> str:
     ]
     by_case = {(r["version"], r["robots"], r["threads"]): r for r in result["rows"]}
     for (version, *case), row in by_case.items():
-        other = by_case.get(("beside", *case))
+        other = by_case.get(("other", *case))
         if version == "this" and other is not None:
-            rows.append(["this : beside", *case, *_ratios(row, other)])
+            rows.append(["this : other", *case, *_ratios(row, other)])
     title = "Processor seconds for every second of log; wall: of the command, for every second of the longest log."
     return "\n".join([title, "", *markdown(head, rows)])
 

@@ -1,7 +1,8 @@
 """Time that the stages of a run take, before they start, and while they are at work.
 
-Seconds of a core of 2.6 GHz, fitted to the parts of whole runs (docs/reference/checks.md). What a machine is slower by,
-and what a recording is harder by, shows while the run goes on, or in the results of earlier ones (`checks.measured`).
+Seconds of one of the two busy threads of a core of 2.6 GHz, fitted to the parts of a whole run
+(docs/reference/checks.md). What a machine is slower by, and what a recording is harder by, shows while the run goes on,
+or in the results of earlier ones (`checks.measured`).
 """
 
 from __future__ import annotations
@@ -13,34 +14,32 @@ from duagc.pipeline.config.mapping import MappingConfig
 
 Size = Mapping[str, int]
 """`frames`, `pixels` of an image and `keyframes` of a robot; `moved`: 1 if depth is of other times than color."""
-TRACKING_S, POSES_S, MODEL_S = (0.007, 0.020), (0.006, 0.020), (0.001, 0.055)
+TRACKING_S, POSES_S, MODEL_S = (0.004, 0.030), (0.008, 0.036), (0.001, 0.063)
 """Of a frame: in any case, and for every million pixels."""
 MOVED_S = 0.35
 """Of moving the depth of a frame, for every million pixels; a frame is read three times."""
-MAPPING_S = (0.002, 0.135)
+MAPPING_S = (0.002, 0.143)
 """The same of a step of mapping, of which every keyframe takes some."""
-FINAL_S = (0.002, 0.160)
+FINAL_S = (0.002, 0.128)
 """The same of a step of the final optimization."""
 START_S = 2.0
 """Of a process."""
 INFORMATION_S = 0.020
 """Of a frame, for every million pixels."""
-FUSION_S = (6.0, 200.0)
+FUSION_S = (3.0, 67.0)
 """Of a robot that has peers: in any case, and for every million pixels of an image."""
-SCORED_S, COMPARED_S = 0.35, 0.60
+SCORED_S, COMPARED_S = 0.34, 0.90
 """Of a render that is scored, and of a view that is compared with the others, for every million pixels."""
 VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
 RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
 """Maps that are drawn at a held-out view, at a keyframe, and at a view of a peer."""
-EXCHANGE_S = 6.0
+EXCHANGE_S = 5.5
 """Of a pair of robots, and of the team."""
 READERS_S = 6.0
 """Report and view."""
 SERIAL = 0.15
 """Share of a stage of several threads that one thread does."""
-SHARED_CORE = 1.6
-"""By how much slower two processes are that share a core."""
 
 
 def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
@@ -132,23 +131,21 @@ def side_by_side_s(begun: Iterable[float], waiting: Sequence[float], workers: in
     return max(ends, default=0.0)
 
 
-def threaded_s(seconds: float, cores: int, processors: int) -> float:
+def threaded_s(seconds: float, processors: int) -> float:
     """Time of a stage that uses all processors.
 
     Args:
         seconds: that one thread takes.
-        cores: of the machine.
         processors: of the machine; threads of a core count each.
     """
-    speed = cores * (2 / SHARED_CORE if processors > cores else 1.0)
-    return seconds * (SERIAL + (1 - SERIAL) / speed)
+    return seconds * (SERIAL + (1 - SERIAL) / processors)
 
 
-def slowdown(workers: int, cores: int) -> float:
-    """By how much slower each of some processes is than one alone.
+def slowdown(workers: int, processors: int) -> float:
+    """By how much slower each of some processes is than where every one has a processor.
 
     Args:
         workers: processes at work.
-        cores: of the machine, not counting the threads of a core.
+        processors: of the machine; threads of a core count each.
     """
-    return 1.0 if workers <= cores else SHARED_CORE * max(1.0, workers / (2 * cores))
+    return max(1.0, workers / processors)

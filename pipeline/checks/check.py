@@ -188,7 +188,9 @@ def format_report(report: Report) -> str:
     span = f"{e['seconds_from'] / unit:.0f} to {e['seconds_to'] / unit:.0f} {name}"
     here = f" (as {e['measured_stages']:.0f} stages took here)" if e["measured_stages"] else ""
     if report.robots:
-        out.append(f"a run takes {span} on two idle cores{here}, and about {e['bytes'] / 1e6:.0f} MB of disk")
+        out.append(
+            f"a run takes {span} on two idle processors{here}, and about {e['bytes'] / 1e6:.0f} MB of disk"
+        )
     out += lines(report.findings)
     counts = [f"{len(found)} {s.value}{'s' * (len(found) != 1)}" for s in Severity if (found := report.of(s))]
     return "\n".join([*out, ", ".join(counts) or "nothing found"])

@@ -16,7 +16,7 @@ from duagc.pipeline.checks.geometry import Move
 from duagc.pipeline.config.frontend import KeyframeConfig
 
 RANGE = (1 / 1.5, 1.5)  # of the expected time
-WORKERS = 2  # robots at a time, as `duagc run` has them by default, each with a core to itself
+WORKERS = 2  # robots at a time, as `duagc run` has them by default, each with a processor to itself
 BYTES_PER_ROBOT = 50_000_000  # maps at their cap of Gaussians with information; report and Rerun file
 BYTES_PER_FRAME = 25_000
 
@@ -39,7 +39,7 @@ def keyframes(moved: Sequence[Move], frames: int, duration_ns: int) -> int:
 def estimate(
     robots: Mapping[str, Mapping[str, Any]], ratios: Mapping[str, float] = MappingProxyType({})
 ) -> dict[str, float]:
-    """Seconds (from, to) of a run on two idle cores and bytes on disk.
+    """Seconds (from, to) of a run on two idle processors and bytes on disk.
 
     Args:
         robots: `frames`, `pixels` of an image, `keyframes` and `moved` of every robot.
@@ -57,7 +57,7 @@ def estimate(
     if len(rows) > 1:
         seconds += durations.exchange_s(len(rows))
         fused_s = ratios.get("fusion", 1.0) * sum(map(durations.fusion_s, rows))
-        seconds += durations.threaded_s(fused_s, WORKERS, WORKERS)
+        seconds += durations.threaded_s(fused_s, WORKERS)
     size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
     return {"seconds_from": RANGE[0] * seconds, "seconds_to": RANGE[1] * seconds, "bytes": float(size)}
 

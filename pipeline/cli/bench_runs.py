@@ -21,7 +21,7 @@ def bench_realtime(
     recording: Recorded,
     robots: Annotated[str, typer.Option(help="Sizes of the team: the first robots by name.")] = "1,2",
     threads: Annotated[str, typer.Option(help="Processors that a run may use.")] = "1,2",
-    beside: Annotated[
+    other: Annotated[
         Path | None,
         typer.Option(help="`duagc` of another version, which runs the same in turn.", show_default=False),
     ] = None,
@@ -30,7 +30,7 @@ def bench_realtime(
     ] = None,
     no_open3d: Annotated[bool, typer.Option("--no-open3d", help="Without Open3D's odometry.")] = False,
     no_evaluation: Annotated[
-        bool, typer.Option("--no-evaluation", help="Without metrics and report (not with --beside).")
+        bool, typer.Option("--no-evaluation", help="Without metrics and report (not with --other).")
     ] = False,
     overrides: Overrides = None,
     as_json: Json = False,
@@ -41,17 +41,17 @@ def bench_realtime(
 
     Examples: `duagc bench realtime recordings/redkitchen`,
     `duagc bench realtime recordings/office8 --robots 1,2,4,8 --threads 2 --seconds 4`,
-    `duagc bench realtime recordings/redkitchen --robots 2 --threads 2 --beside ../before/.venv/bin/duagc`
+    `duagc bench realtime recordings/redkitchen --robots 2 --threads 2 --other ../before/.venv/bin/duagc`
     """
     from duagc.pipeline.bench import realtime
 
-    if no_evaluation and beside is not None:
+    if no_evaluation and other is not None:
         raise typer.BadParameter("other versions may not know it", param_hint="--no-evaluation")
     plan = realtime.RealtimePlan(
         recording,
         tuple(counts("--robots", robots)),
         tuple(counts("--threads", threads)),
-        beside=beside,
+        other=other,
         open3d=not no_open3d,
         seconds=seconds,
         options=(*_options(overrides), *(["--no-evaluation"] if no_evaluation else [])),

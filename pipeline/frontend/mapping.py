@@ -45,7 +45,7 @@ from duagc.pipeline.splat.optimizer import smoothstep_decay
 from duagc.pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
 MANY_VIEWS = 16
-"""Views from which on every second one tells what a Gaussian contributes to all."""
+"""Views from which on every second one reports what a Gaussian contributes to all."""
 
 
 @dataclass(frozen=True)

@@ -73,11 +73,11 @@ def test_realtime_is_the_time_of_runs_by_the_time_of_logs(
 ) -> None:
     monkeypatch.setattr(realtime, "THIS", (str(command(tmp_path, 3.0)),))
     plan = realtime.RealtimePlan(
-        recording.path, (1, 2), (1,), beside=command(tmp_path, 6.0), open3d=False, seconds=0.2
+        recording.path, (1, 2), (1,), other=command(tmp_path, 6.0), open3d=False, seconds=0.2
     )
     result = realtime.run(plan)
     assert [(r["version"], r["robots"]) for r in result["rows"]] == [
-        ("this", 1), ("beside", 1), ("this", 2), ("beside", 2),
+        ("this", 1), ("other", 1), ("this", 2), ("other", 2),
     ]  # fmt: skip
     for row, whole in zip(result["rows"], (3.0 + 1, 6.0 + 1, 6.0 + 1, 12.0 + 1), strict=True):
         log_s = 0.2 * row["robots"]
@@ -90,7 +90,7 @@ def test_realtime_is_the_time_of_runs_by_the_time_of_logs(
         assert found["whole"] == pytest.approx(whole / log_s, abs=1e-3)
         assert row["peak_memory_mb"] == 100.0
     lines = realtime.format_table(result).splitlines()
-    ratios = [line for line in lines if "this : beside" in line]
+    ratios = [line for line in lines if "this : other" in line]
     assert len(ratios) == 2
     assert all("0.50x" in line for line in ratios)
 
@@ -115,7 +115,7 @@ def test_length_says_what_a_further_second_costs(
     ("words", "said"),
     [
         (["realtime", "--robots", "3"], "has 2 robots, expected 3 or more"),
-        (["realtime", "--beside", "/nowhere/duagc"], "/nowhere/duagc: no such command"),
+        (["realtime", "--other", "/nowhere/duagc"], "/nowhere/duagc: no such command"),
         (["realtime", "--robots", "none"], "'none' is not a positive number"),
     ],
 )
