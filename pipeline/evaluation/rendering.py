@@ -133,11 +133,17 @@ def robot_scores(
     own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
 
     def score(task: RenderTask, view_set: str, title: str) -> None:
-        def scored() -> list[Scored]:
-            views_of_set = task.scores(source, threads, title if progress else None)
-            return [(kind, view_set, i, score) for i, of in views_of_set for kind, score in of.items()]
+        name = f"{view_set} of {task.camera_robot.robot}"
 
-        found.extend(save.done(f"{view_set} of {task.camera_robot.robot}", scored))
+        def scored() -> list[Scored]:
+            views_done: list[dict[str, Scored]] = (save.resume(name) or (0, []))[1]
+            rest = task.scores(source, threads, title if progress else None, skip=len(views_done))
+            for index, scores in rest:
+                views_done.append({kind: (kind, view_set, index, score) for kind, score in scores.items()})
+                save.at(name, len(views_done), task.most, lambda: views_done)
+            return [row for view in views_done for row in view.values()]
+
+        found.extend(save.done(name, scored))
 
     task = RenderTask(own, robot, "held_out", robot.own_map.depth, most_views)
     score(task, "held_out", f"render maps of {name}")
@@ -224,14 +230,14 @@ class RenderTask:
     most: int = MOST_VIEWS
 
     def scores(
-        self, source: Recording, threads: int, title: str | None
+        self, source: Recording, threads: int, title: str | None, *, skip: int = 0
     ) -> Iterator[tuple[int, dict[str, views.ViewScore | Absent]]]:
-        """Frame index and the maps' scores of every view, in order; progress under `title`."""
+        """Frame index and the maps' scores of every view but the first `skip`, in order; progress under `title`."""
         name, robot = self.camera_robot.robot, self.camera_robot
         keyframes = {k.frame_index for k in robot.keyframes}
         frames_of_set = sorted(robot.held_out if self.view_set == "held_out" else keyframes)
         count = min(self.most, len(frames_of_set))
-        chosen = [frames_of_set[k] for k in evenly_spaced(len(frames_of_set), count)]
+        chosen = [frames_of_set[k] for k in evenly_spaced(len(frames_of_set), count)][skip:]
         with open_rgbd(source.log(name)) as log:
             log.move_depth_by(robot.folder / "frontend.mcap")
             stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}

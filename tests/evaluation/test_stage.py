@@ -1,6 +1,7 @@
 """The contract of metrics.json, and its numbers on a run whose every number is known."""
 
 import json
+import math
 import shutil
 from fnmatch import fnmatchcase
 from inspect import signature
@@ -211,6 +212,41 @@ def test_an_evaluation_that_was_killed_goes_on_with_what_is_done(metrics, tmp_pa
     monkeypatch.setattr(scored_views, "score_maps", lambda *a, **k: drawn.append(0) or score_maps(*a, **k))
     assert evaluate(fake.run, fake.recording, progress=False, saved=saved) == metrics
     assert len(drawn) == 3  # bravo's
+
+
+def test_a_set_of_views_goes_on_where_it_was_killed(metrics, tmp_path, monkeypatch):
+    fake, saved = make(tmp_path), tmp_path / "saved"
+    monkeypatch.setattr(checkpoints, "EVERY_S", 0.0)
+    monkeypatch.setattr(robot_measures.Checkpoints.__init__, "__kwdefaults__", {
+        **robot_measures.Checkpoints.__init__.__kwdefaults__, "every_s": 0.0, "largest_share": math.inf,
+    })  # fmt: skip
+    score_view, scored = scored_views.score_view, []
+
+    def killed_at_the_third(*args, **kwargs):
+        if len(scored) == 9:
+            raise KeyboardInterrupt
+        scored.append(0)
+        return score_view(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scored_views, "score_view", killed_at_the_third)
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(fake.run, fake.recording, threads=1, progress=False, saved=saved)
+    (state,) = (saved / "alpha").glob("*.state")
+    done, rows = checkpoints.Checkpoints(saved / "alpha").resume(state.stem)
+    kept = sum(map(len, rows))
+    assert done == len(rows) > 0
+    assert 0 < kept <= len(scored)
+    counted = []
+    monkeypatch.setattr(scored_views, "score_view", lambda *a, **k: counted.append(0) or score_view(*a, **k))
+    assert evaluate(fake.run, fake.recording, threads=1, progress=False, saved=saved) == metrics
+    views = sum(
+        metrics["rendering"][kind][s]["views"]
+        for kind in metrics["rendering"]
+        for s in metrics["rendering"][kind]
+        if s != "team"
+    )
+    assert len(counted) + kept == views
 
 
 def test_few_views_of_a_set_are_scored_if_asked(metrics, tmp_path):
