@@ -96,8 +96,8 @@ class TimeLeft:
         evaluated = durations.side_by_side_s(
             (), [durations.evaluation_s(s, len(sizes)) for s in sizes], self._workers
         )
-        alone_s = [durations.threaded_s(durations.fusion_s(s), processors()) for s in sizes]
-        fused = [(stages.FUSION, seconds) for seconds in alone_s] if len(sizes) > 1 else []
+        fused_s = [durations.threaded_s(durations.fusion_s(s), processors()) for s in sizes]
+        fused = [(stages.FUSION, seconds) for seconds in fused_s] if len(sizes) > 1 else []
         expected = [
             (stages.EXCHANGE, durations.exchange_s(len(sizes))),
             *fused,

@@ -51,9 +51,12 @@ def execute(
         options: more words of the command.
 
     Raises:
-        DuagError: the command failed; with the last line that it said.
+        DuagError: the machine has fewer processors, or the command failed; with the last line that it said.
     """
-    allowed = sorted(os.sched_getaffinity(0))[:processors]
+    usable = sorted(os.sched_getaffinity(0))
+    if processors > len(usable):
+        raise DuagError(f"--threads {processors}: found {len(usable)} processors, expected {processors}")
+    allowed = usable[:processors]
     words = [*command, "run", str(recording), "--out", str(out), "--workers", str(processors), *options]
     began_s = time.perf_counter()
     done = subprocess.run(

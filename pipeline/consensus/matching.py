@@ -109,7 +109,7 @@ def threshold(own: Evidence, config: MapMatching) -> float:
     if len(own) < 2:
         return 0.0
     near, other = _neighbors(own.theta[:, MEAN], config.radius_m)
-    return _threshold(_Chart.of(own.theta, config) if len(near) else None, near, other, config)
+    return _threshold(_Chart.of(own.theta, config), near, other, config)
 
 
 def _neighbors(means: Array, radius_m: float) -> tuple[Index, Index]:
@@ -120,8 +120,8 @@ def _neighbors(means: Array, radius_m: float) -> tuple[Index, Index]:
     return near, np.where(neighbor[near, 1] == near, neighbor[near, 0], neighbor[near, 1])
 
 
-def _threshold(chart: _Chart | None, near: Index, other: Index, config: MapMatching) -> float:
-    if chart is None or not len(near):
+def _threshold(chart: _Chart, near: Index, other: Index, config: MapMatching) -> float:
+    if not len(near):
         return 0.0
     return float(np.percentile(_distances((chart, chart), near, other, config), config.percentile))
 

@@ -1,6 +1,6 @@
 """Poses that are not final yet, flooded so that a contact may end at any time.
 
-Evidence hangs on keyframes: without their poses nothing of it can be used. Final poses come when the whole component
+Evidence is anchored to keyframes: without their poses none of it is of use. Final poses come when the whole component
 has converged, which may be after the robots have lost each other. So every robot sends its neighbors where its
 keyframes lie from its first one, as soon as they meet, and floods its poses when the solver starts, and again when they
 have moved. They count only where final ones have not arrived.

@@ -275,7 +275,7 @@ class Sharing:
 
     @property
     def matcher(self) -> Matcher:
-        """This."""
+        """What a solver asks for matched Gaussians: this object."""
         return self
 
     def is_here(self, owner: int) -> bool:
@@ -296,7 +296,7 @@ class Sharing:
         return self.matched(Anchors(self.own, T_own, nowhere), Anchors(other, T_other, nowhere))
 
     def positions(self, owner: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array, Array]:
-        """Keyframes [p] that Gaussians hang on, their means [p, 3] and the information of these [p, 3, 3], there.
+        """Anchors [p] of Gaussians, their means [p, 3] and the information of these [p, 3, 3], in the anchors' frames.
 
         Args:
             owner: index of the robot.

@@ -133,3 +133,11 @@ def test_a_command_that_fails_is_named_with_its_last_line(
     plan = realtime.RealtimePlan(recording.path, (1,), (1,), open3d=False, options=("--fail",))
     with pytest.raises(DuagError, match="said 'duagc: no such thing' and ended with 1"):
         realtime.run(plan)
+
+
+def test_more_processors_than_there_are_are_refused(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whole_runs.os, "sched_getaffinity", lambda _: {0, 1})
+    with pytest.raises(DuagError, match="--threads 3: found 2 processors, expected 3"):
+        whole_runs.execute(("nothing",), recording.path, tmp_path / "out", processors=3)

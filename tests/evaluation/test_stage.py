@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from fnmatch import fnmatchcase
+from functools import partial
 from inspect import signature
 
 import numpy as np
@@ -216,10 +217,8 @@ def test_an_evaluation_that_was_killed_goes_on_with_what_is_done(metrics, tmp_pa
 
 def test_a_set_of_views_goes_on_where_it_was_killed(metrics, tmp_path, monkeypatch):
     fake, saved = make(tmp_path), tmp_path / "saved"
-    monkeypatch.setattr(checkpoints, "EVERY_S", 0.0)
-    monkeypatch.setattr(robot_measures.Checkpoints.__init__, "__kwdefaults__", {
-        **robot_measures.Checkpoints.__init__.__kwdefaults__, "every_s": 0.0, "largest_share": math.inf,
-    })  # fmt: skip
+    every_view = partial(checkpoints.Checkpoints, every_s=0.0, largest_share=math.inf)
+    monkeypatch.setattr(robot_measures, "Checkpoints", every_view)
     score_view, scored = scored_views.score_view, []
 
     def killed_at_the_third(*args, **kwargs):
