@@ -55,9 +55,13 @@ nearly twice the way to the minimum, each overshoots where the other was, and bo
 PRIMAL = 1e-4  # m, rad: the paper's stopping test
 DAMPING = 0.7  # both ends of a link step at once
 SCATTER_M = 0.01
+"""Standard deviation by which the means of two matched Gaussians differ where both maps are right."""
 SPLATS_PER_SAMPLE = 30.0
+"""Gaussians that share a pixel: their information is of the same measurements and counts once."""
 ROUNDS_BEFORE_MATCHING = 10
+"""Until poses are near enough to their final ones to match at."""
 STILL_ROUNDS = 8
+"""Rounds without a step above the tolerance after which a robot has converged."""
 POSES, MEANS = b"\0", b"\1"
 _HEAD = struct.Struct("<I")  # round of the sender
 
@@ -204,10 +208,10 @@ class Algorithm1Solver:
                     [np.broadcast_to(np.eye(3), R.shape), -R @ so3.hat(peer.pairs.mean)], axis=2
                 )
                 J_t = np.swapaxes(J, -1, -2)
-                weighted = peer.pairs.weight
-                np.add.at(g, peer.pairs.anchor, (J_t @ (weighted @ off[..., None]))[..., 0])
+                weight = peer.pairs.weight
+                np.add.at(g, peer.pairs.anchor, (J_t @ (weight @ off[..., None]))[..., 0])
                 if curvature is not None:
-                    np.add.at(curvature, peer.pairs.anchor, J_t @ weighted @ J)
+                    np.add.at(curvature, peer.pairs.anchor, J_t @ weight @ J)
         return g
 
     def _gradient_step(self) -> Array:
