@@ -25,10 +25,11 @@ def median(values: NDArray[np.floating]) -> float:
     """
     flat = values.ravel()
     middle, odd = divmod(flat.size, 2)
-    ordered = np.partition(flat, (middle, -1) if odd else (middle - 1, middle, -1))
-    if np.isnan(ordered[-1]):  # NaN is the largest
+    ordered = np.partition(flat, middle)  # one place: several take five times as long
+    above = ordered[middle:]
+    if np.isnan(above.max()):  # NaN is the largest
         return float("nan")
-    return float(ordered[middle] if odd else (ordered[middle - 1] + ordered[middle]) / flat.dtype.type(2))
+    return float(above[0] if odd else (ordered[:middle].max() + above[0]) / flat.dtype.type(2))
 
 
 def mad_sigmas(deviations: NDArray[np.float64]) -> NDArray[np.float64]:
