@@ -35,12 +35,12 @@ _C1, _C2 = 0.01**2, 0.03**2
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
-def _window_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def _window_mean(image: Image) -> Image:
     """11x11 Gaussian-weighted mean (sigma 1.5), only where the window lies inside the image."""
     import cv2
 
-    weights = cv2.getGaussianKernel(2 * _WINDOW_RADIUS + 1, _WINDOW_SIGMA, cv2.CV_64F)
-    smooth = cv2.sepFilter2D(image, cv2.CV_64F, weights, weights)
+    weights = cv2.getGaussianKernel(2 * _WINDOW_RADIUS + 1, _WINDOW_SIGMA, cv2.CV_32F)
+    smooth = cv2.sepFilter2D(image, cv2.CV_32F, weights, weights)
     inside = slice(_WINDOW_RADIUS, -_WINDOW_RADIUS)
     return np.asarray(smooth[inside, inside])
 
@@ -65,14 +65,14 @@ class _Scale:
     `counted`: window positions that count; None: all.
     """
 
-    y: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    y: Image
+    mean: Image
+    variance: Image
     mask: masks.Mask | None
     counted: masks.Mask | None
 
     @staticmethod
-    def of(y: NDArray[np.float64], mask: masks.Mask | None) -> _Scale:
+    def of(y: Image, mask: masks.Mask | None) -> _Scale:
         if min(y.shape[:2]) < 2 * _WINDOW_RADIUS + 1:
             raise ValueError(
                 f"an image of {y.shape[1]}x{y.shape[0]} is smaller than the 11x11 window of SSIM"
@@ -85,7 +85,7 @@ class _Scale:
         """The next scale."""
         return _Scale.of(halve(self.y), None if self.mask is None else masks.halved(self.mask))
 
-    def terms(self, x: NDArray[np.float64]) -> tuple[float, float]:
+    def terms(self, x: Image) -> tuple[float, float]:
         """Mean SSIM and mean contrast-structure term of a render [H, W, C] in 0..1."""
         whole, structure = np.empty_like(self.mean), np.empty_like(self.mean)
         for top in range(0, len(self.mean), _STRIP_ROWS):
@@ -97,18 +97,16 @@ class _Scale:
                 raise ValueError("no 11x11 window of SSIM has usable pixels only")
             if not self.counted.all():
                 whole, structure = whole[self.counted], structure[self.counted]
-        return float(np.mean(whole)), float(np.mean(structure))
+        return float(np.mean(whole, dtype=np.float64)), float(np.mean(structure, dtype=np.float64))
 
-    def _strip(
-        self, x: NDArray[np.float64], y: NDArray[np.float64], rows: slice
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _strip(self, x: Image, y: Image, rows: slice) -> tuple[Image, Image]:
         """SSIM and contrast-structure term of some rows of windows, from the pixels that they see."""
         mx, my = _window_mean(x), self.mean[rows]
         vx = _window_mean(x * x) - mx * mx
         cov = _window_mean(x * y) - mx * my
         structure = (2 * cov + _C2) / (vx + self.variance[rows] + _C2)
         luminance = (2 * mx * my + _C1) / (mx * mx + my * my + _C1)
-        return luminance * structure, structure
+        return np.asarray(luminance * structure), np.asarray(structure)
 
 
 class SsimReference:
@@ -121,7 +119,7 @@ class SsimReference:
             reference: colors [H, W, 3] in 0..1.
             mask: bool [H, W], pixels that count: window positions that touch another one are left out; None: all.
         """
-        self._y, self._mask = np.asarray(reference, np.float64), mask
+        self._y, self._mask = np.asarray(reference, np.float32), mask
         self._scales: list[_Scale] = []
 
     def has_windows(self, scales: int) -> bool:
@@ -164,8 +162,8 @@ class SsimReference:
             x = halve(x) if k < len(weights) - 1 else x
         return first, product
 
-    def _clipped(self, rendered: NDArray) -> NDArray[np.float64]:
-        x = np.clip(np.asarray(rendered, np.float64), 0.0, 1.0)
+    def _clipped(self, rendered: NDArray) -> Image:
+        x = np.clip(np.asarray(rendered, np.float32), 0.0, 1.0)
         if x.shape != self._y.shape:
             raise ValueError(f"images of different shapes: {x.shape} and {self._y.shape}")
         return x

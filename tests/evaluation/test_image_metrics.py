@@ -39,7 +39,7 @@ def test_ssim_agrees_with_its_definition_window_by_window() -> None:
                 )
                 top = (2 * mp * mq + 1e-4) * (2 * cov + 9e-4)
                 values.append(top / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
-    assert ssim(x, y) == pytest.approx(np.mean(values), abs=1e-9)
+    assert ssim(x, y) == pytest.approx(np.mean(values), abs=3e-7)  # in float32
     assert ssim(x, x) == pytest.approx(1.0, abs=1e-12)
 
 
