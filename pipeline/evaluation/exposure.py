@@ -131,12 +131,15 @@ def _squared_errors(
         if isinstance(found, Absent):
             return found
         gains[channel], offsets[channel] = found
-    shown = gains * color[:, scored]
-    shown += offsets * alpha[:, scored]
-    np.clip(shown, 0, 1, out=shown)
-    shown -= image[:, scored]
-    shown *= shown
-    return np.asarray(shown)
+    shown = np.empty_like(image[:, scored])
+    for channel in range(3):  # one by one: arithmetic along an axis of three is slow
+        one = gains[channel] * color[:, scored, channel]
+        one += offsets[channel] * alpha[:, scored, 0]
+        np.clip(one, 0, 1, out=one)
+        one -= image[:, scored, channel]
+        one *= one
+        shown[..., channel] = one
+    return shown
 
 
 def _thinned(used: NDArray[np.bool_]) -> NDArray[np.bool_]:
