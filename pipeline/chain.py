@@ -175,7 +175,7 @@ class Chain:
             with timing.stage(stage, carrier.folder):
                 if stage is stages.EVALUATION:
                     saved = carrier.checkpoints(carrier.key(stage, None, inputs)).folder
-                    steps.evaluation(carrier.folder, recording, workers(), saved)
+                    steps.evaluation(carrier.folder, recording, workers(), saved, hear=self._watch.tell)
                 else:
                     step = steps.report if stage is stages.REPORT else steps.view
                     step(carrier.folder, recording, workers())

@@ -15,6 +15,7 @@ from typing import Any
 from duagc import __version__
 from duagc.pipeline import steps
 from duagc.pipeline.base.component_names import robot_of
+from duagc.pipeline.base.worker_reports import Step
 from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
@@ -29,7 +30,7 @@ from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
 from duagc.pipeline.runs.folder import SCHEMA
 from duagc.pipeline.steps import threads_per_worker
 from duagc.pipeline.time_left import EVERY_S, TimeLeft
-from duagc.pipeline.watch import UNWATCHED, Watch, ticking
+from duagc.pipeline.watch import Watch, ticking
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 READER_SHARE = 2.0  # memory of the evaluation of a robot, relative to its preparation
@@ -80,7 +81,7 @@ class Job:
         self._calibration: dict[str, Any] = {}
         self._before: list[Carried] = []
         self._place = place
-        self._watch, self._where = UNWATCHED, None  # type: Watch, Any
+        self._watch, self._where = Watch(self._hear), None  # type: Watch, Any
         self._time_left: TimeLeft | None = None
 
     def run(self) -> None:
@@ -93,7 +94,7 @@ class Job:
             from duagc.pipeline.viewing.follow import Follower
 
             follower, self._where = Follower.serving(self.recording)
-            self._watch = Watch(follower=follower)
+            self._watch = Watch(self._hear, follower)
             self.log(f"follow the run with: rerun {self._where[0]}")
         try:
             with ticking(self._say_time_left, EVERY_S):
@@ -101,6 +102,10 @@ class Job:
         finally:
             if self._watch.follower is not None:
                 self._watch.follower.close()
+
+    def _hear(self, step: Step) -> None:
+        if self._time_left is not None:
+            self._time_left.step(*step)
 
     def _say_time_left(self) -> None:
         if self._time_left is not None:
@@ -248,11 +253,11 @@ class Job:
             workers = self._fitting(sizes)
             self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
             self._check_registration(absent)
-            self._time_left = times = self._expected(sizes, found, workers)
+            self._time_left = self._expected(sizes, found, workers)
             preparation = Preparation(
                 self.recording.path, self.folder, self.config, self.plan, self._place, self._where
             )
-            found |= preparation.run(absent, workers, alone=alone, hear=lambda step: times.step(*step))
+            found |= preparation.run(absent, workers, alone=alone, hear=self._hear)
         else:
             self.log(f"front end and information: {len(found)} robots from the store")
             self._time_left = self._expected({}, found, self.plan.workers)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline import steps, watch
+from duagc.pipeline.base import worker_reports
 from duagc.pipeline.base.machine import memory_bytes
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.cache.carrier import Carrier
@@ -129,7 +130,7 @@ class Preparation:
     where: Any = None
 
     def run(
-        self, robots: Sequence[str], workers: int, *, alone: bool, hear: Callable[[watch.Step], None]
+        self, robots: Sequence[str], workers: int, *, alone: bool, hear: worker_reports.Hear
     ) -> dict[str, Prepared]:
         """Prepare robots; by name of the component.
 
@@ -141,7 +142,10 @@ class Preparation:
         """
         threads = steps.threads_per_worker(workers)
         found: dict[str, Prepared] = {}
-        with watch.listening(hear) as queue, worker_pool(workers, watch.keep_queue, (queue,)) as pool:
+        with (
+            worker_reports.listening(hear) as queue,
+            worker_pool(workers, worker_reports.keep_queue, (queue,)) as pool,
+        ):
             tasks = [pool.submit(self.prepare, robot, threads=threads, alone=alone) for robot in robots]
             for task in tasks:
                 found |= task.result()

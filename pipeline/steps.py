@@ -13,6 +13,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.component_names import component_name
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.machine import processors
+from duagc.pipeline.base.worker_reports import Hear
 
 if TYPE_CHECKING:
     from duagc.pipeline.base.checkpoints import Checkpoints
@@ -244,7 +245,14 @@ def fuse_robot(
     return {check.peer: check.reason for check in checks if not check.trusted}
 
 
-def evaluation(folder: Path, recording: Path, workers: int = 1, saved: Path | None = None) -> None:
+def evaluation(
+    folder: Path,
+    recording: Path,
+    workers: int = 1,
+    saved: Path | None = None,
+    *,
+    hear: Hear = lambda step: None,
+) -> None:
     """Measure the run.
 
     Args:
@@ -252,11 +260,13 @@ def evaluation(folder: Path, recording: Path, workers: int = 1, saved: Path | No
         recording: folder of its recording.
         workers: robots measured at the same time; changes no bit of the result.
         saved: folder of what is done, from which it goes on; None: nothing is saved.
+        hear: gets its steps; changes nothing.
     """
     from duagc.pipeline.evaluation import evaluate
 
     determinism.configure_opencv()
-    evaluate(folder, recording, threads=threads_per_worker(workers), workers=workers, saved=saved)
+    threads = threads_per_worker(workers)
+    evaluate(folder, recording, threads=threads, workers=workers, saved=saved, hear=hear)
 
 
 def report(folder: Path, recording: Path, workers: int = 1) -> None:

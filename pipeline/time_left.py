@@ -1,7 +1,7 @@
 """How far a run is, and how long it still takes.
 
 What every stage takes is predicted from the size of its logs (`cache.durations`). How much slower this machine and this
-recording are is learned from what is done, and counts for what is left.
+recording are is learned from what is done, and counts for what is left that is of the same kind.
 """
 
 from __future__ import annotations
@@ -9,46 +9,27 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 
 from duagc.pipeline.base.machine import processors
 from duagc.pipeline.cache import durations
 from duagc.pipeline.cache.durations import Size
+from duagc.pipeline.cache.robots_work import LEAST_LEFT, START, TRUSTED_S, RobotsWork, RobotWork
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.runs import stages
 
 EVERY_S = 10.0
 KEYFRAMES_OF_FRAMES = 0.06
 """Until the keyframes of a robot are known."""
-TRUSTED_S = 5.0
-"""So many predicted seconds count for the prediction: the first steps of a run say little."""
-LEAST_LEFT = 0.1
-"""Of what a stage takes, where it takes longer than it should."""
+UNHEARD = ("poses", "agreement")
+"""Parts of a front end, and of an evaluation, that do not say how far they are."""
 PARTS = {"tracking again": "tracking", "keyframes": "poses"}
 """Parts of a front end that are not named as in `durations`."""
-
-
-@dataclass
-class RobotWork:
-    """The front end of a robot.
-
-    Attributes:
-        size: of its log.
-        known: whether its keyframes are.
-        part: what it does now, in words; "": it has not begun, or is done.
-        earlier_s: predicted seconds that another process had done before.
-        began_s: when; None: it has not.
-        took_s: how long it was at work; None: it is not done.
-        parts: share of every part that is done.
-    """
-
-    size: dict[str, int]
-    known: bool = False
-    part: str = ""
-    earlier_s: float = 0.0
-    began_s: float | None = None
-    took_s: float | None = None
-    parts: dict[str, float] = field(default_factory=dict)
+IMAGES = (START, "tracking", "poses", "model")
+"""Parts of a front end that take as long as images are large, as the evaluation does."""
+GAUSSIANS = ("mapping", "final")
+"""Parts of a front end that take as long as the map has Gaussians, as fusion does."""
+LIKE = {stages.FUSION.name: GAUSSIANS, stages.EVALUATION.name: IMAGES}
+"""Parts of the front end that a stage is like; any other is like all of them."""
 
 
 class TimeLeft:
@@ -74,68 +55,70 @@ class TimeLeft:
             wanted: stages that are done.
             clock: seconds.
         """
-        self._mapping, self._workers, self._clock = mapping, max(1, min(workers, len(robots))), clock
-        self._lock = threading.Lock()
-        self.robots = {
-            name: RobotWork({"keyframes": self._guess(size), **size}, "keyframes" in size)
-            for name, size in robots.items()
-        }
-        self._later = self._units([*(work.size for work in self.robots.values()), *found.values()], wanted)
+        self._mapping, self._clock, self._lock = mapping, clock, threading.Lock()
+        self._sizes = {name: {"keyframes": _guess(size), **size} for name, size in robots.items()}
+        self._words: dict[str, str] = {}  # what front ends are at
+        preparing, reading = (max(1, min(workers, n)) for n in (len(robots), len(robots) + len(found)))
+        front = {name: RobotWork(self._front_end(size), UNHEARD) for name, size in self._sizes.items()}
+        slower = durations.slowdown(preparing, processors())
+        self._front = RobotsWork(front, preparing, slower, clock())
+        self._found, self._wanted, self._reading = dict(found), wanted, reading
+        self._predict_later()
         # stage that this process does, predicted seconds, since when
         self._now: tuple[str, float, float] | None = None
         # measured and predicted seconds of stages that are done
         self._taken: dict[str, tuple[float, float]] = {}
 
-    @staticmethod
-    def _guess(size: Size) -> int:
-        return max(1, round(KEYFRAMES_OF_FRAMES * size["frames"]))
+    def _front_end(self, size: Size) -> dict[str, float]:
+        parts = durations.front_end_parts(size, self._mapping)
+        return parts | {"information": durations.information_s(size)}
 
-    def _units(self, sizes: Sequence[Size], wanted: Sequence[stages.Stage]) -> list[tuple[str, float]]:
+    def _predict_later(self) -> None:
         """What follows the front ends, in order: stages, and predicted seconds; fusion robot by robot."""
-        slower = durations.slowdown(self._workers, processors())
-        evaluated = durations.side_by_side_s(
-            (), [durations.evaluation_s(s, len(sizes)) for s in sizes], self._workers
-        )
+        team, reading = self._sizes | self._found, self._reading
+        works = {name: RobotWork(_evaluation(name, size, list(team)), UNHEARD) for name, size in team.items()}
+        one_s, many = durations.threaded_s(1.0, processors()), durations.slowdown(reading, processors())
+        self._evaluation = RobotsWork(works, reading, one_s if reading == 1 else many, self._clock())
+        sizes = list(team.values())
         fused_s = [durations.threaded_s(durations.fusion_s(s), processors()) for s in sizes]
         fused = [(stages.FUSION, seconds) for seconds in fused_s] if len(sizes) > 1 else []
         expected = [
-            (stages.EXCHANGE, durations.exchange_s(len(sizes))),
+            (stages.EXCHANGE, durations.exchange_s(sizes)),
             *fused,
-            (stages.EVALUATION, slower * evaluated),
+            (stages.EVALUATION, self._evaluation.predicted_s()),
             (stages.REPORT, durations.READERS_S / 2),
             (stages.VIEW, durations.READERS_S / 2),
         ]
-        return [(stage.name, seconds) for stage, seconds in expected if stage in wanted]
+        self._later = [(stage.name, seconds) for stage, seconds in expected if stage in self._wanted]
 
     def step(self, robot: str, part: str, done: int, total: int) -> None:
-        """A step of a front end.
+        """A step of a front end, or of the evaluation of a robot.
 
         Args:
             robot: whose.
             part: its name, as of `Checkpoints`.
             done: steps.
-            total: steps; 0: the robot is done.
+            total: steps; 0: the front end is done.
         """
         with self._lock:
-            work = self.robots.get(robot)
+            now = self._clock()
+            if self._now is not None and self._now[0] == stages.EVALUATION.name:
+                self._evaluation.step(robot, part, done / max(total, 1), now)
+                return
+            work = self._front.of.get(robot)
             if work is None:
                 return
-            now, first = self._clock(), work.began_s is None
-            work.began_s = now if work.began_s is None else work.began_s
             if total == 0:
-                work.took_s, work.part = now - work.began_s, ""
+                work.end(now)
+                self._words.pop(robot, None)
                 return
             if part == "keyframes":
-                work.size["keyframes"], work.known = total, True
+                self._sizes[robot]["keyframes"] = total
+                work.parts |= self._front_end(self._sizes[robot])
+                self._predict_later()
             name = _part_of(part)
-            order = list(durations.front_end_parts(work.size, self._mapping))
-            for before in order[: order.index(name)]:
-                work.parts[before] = 1.0
-            if name != "poses":  # many short ones
-                work.parts[name] = max(work.parts.get(name, 0.0), done / total)
-            if first and done > 1:
-                work.earlier_s = self._done(work)
-            work.part = f"{part.removeprefix(f'{robot}.')} {done}/{total}"
+            self._front.step(robot, name, done / total, now)
+            self._words[robot] = f"{part.removeprefix(f'{robot}.')} {done}/{total}"
 
     def begin(self, stage: str) -> None:
         """A stage of the team begins in this process, or goes on with the next robot.
@@ -145,8 +128,8 @@ class TimeLeft:
         """
         with self._lock:
             now = self._clock()
-            for work in self.robots.values():
-                work.took_s = now - (work.began_s or now) if work.took_s is None else work.took_s
+            self._front.end(now)
+            self._words.clear()
             if self._now is not None:
                 before, predicted, since = self._now
                 taken = self._taken.get(before, (0.0, 0.0))
@@ -160,60 +143,56 @@ class TimeLeft:
     def left_s(self) -> float:
         """Seconds until the run is done."""
         with self._lock:
-            now, rate = self._clock(), self._rate()
-            begun, waiting = list[float](), list[float]()
-            slower = durations.slowdown(self._workers, processors())
-            for work in self.robots.values():
-                if work.took_s is not None:
-                    continue
-                left = slower * rate * (self._whole(work) - self._done(work))
-                (waiting if work.began_s is None else begun).append(left)
-            seconds = durations.side_by_side_s(begun, waiting, self._workers)
+            now = self._clock()
+            seconds = self._front.left_s(now)
             if self._now is not None:
-                name, predicted, since = self._now
-                whole = self._rate_of(name, rate) * predicted
-                seconds += max(whole - (now - since), LEAST_LEFT * whole)
-            seconds += sum(self._rate_of(name, rate) * predicted for name, predicted in self._later)
-            return seconds
+                seconds += self._left_of_stage(*self._now, now)
+            return seconds + sum(self._rate_of(name, now) * predicted for name, predicted in self._later)
 
     def line(self) -> str:
         """Where the robots are, and the time left."""
         left = self.left_s()
         with self._lock:
-            at_work = [f"{name}: {work.part}" for name, work in self.robots.items() if work.part]
+            at_work = [f"{name}: {words}" for name, words in sorted(self._words.items())]
             if self._now is not None:
                 at_work = [self._now[0]]
         where = f"{', '.join(at_work)}; " if at_work else ""
         return f"{where}{in_words(left)} left of the run"
 
-    def _whole(self, work: RobotWork) -> float:
-        return durations.front_end_s(work.size, self._mapping) + durations.information_s(work.size)
+    def _left_of_stage(self, name: str, predicted: float, since: float, now: float) -> float:
+        """Seconds of a stage of the team that is at work."""
+        if name == stages.EVALUATION.name and any(w.now is not None for w in self._evaluation.of.values()):
+            return self._evaluation.left_s(now, self._rate_of(name, now))
+        whole = self._rate_of(name, now) * predicted
+        return max(whole - (now - since), LEAST_LEFT * whole)
 
-    def _done(self, work: RobotWork) -> float:
-        parts = durations.front_end_parts(work.size, self._mapping)
-        return sum(work.parts.get(name, 0.0) * seconds for name, seconds in parts.items())
-
-    def _rate(self) -> float:
-        """Measured seconds for every predicted one."""
-        now = self._clock()
-        measured, predicted = (sum(values) for values in zip((0.0, 0.0), *self._taken.values(), strict=True))
-        for work in self.robots.values():
-            if work.began_s is not None:
-                measured += work.took_s if work.took_s is not None else now - work.began_s
-                done = self._done(work) if work.took_s is None else self._whole(work)
-                predicted += durations.slowdown(self._workers, processors()) * (done - work.earlier_s)
-        return (TRUSTED_S + measured) / (TRUSTED_S + predicted)
-
-    def _rate_of(self, stage: str, rate: float) -> float:
-        """The same of a stage: its own once something of it is done."""
+    def _rate_of(self, stage: str, now: float) -> float:
+        """Measured seconds of a stage for every predicted one; its own once something of it is done."""
+        parts = LIKE.get(stage, (*IMAGES, *GAUSSIANS))
         measured, predicted = self._taken.get(stage, (0.0, 0.0))
-        return (TRUSTED_S * rate + measured) / (TRUSTED_S + predicted)
+        return (TRUSTED_S * self._front.rate(now, parts) + measured) / (TRUSTED_S + predicted)
+
+
+def _guess(size: Size) -> int:
+    return max(1, round(KEYFRAMES_OF_FRAMES * size["frames"]))
+
+
+def _evaluation(robot: str, size: Size, team: Sequence[str]) -> dict[str, float]:
+    """Parts of the evaluation of a robot by the names that are told: sets of views say whose they are."""
+    parts = durations.evaluation_parts(size, len(team))
+    peers = [name for name in team if name != robot]
+    return {
+        f"held_out of {robot}": parts["held_out"],
+        f"training of {robot}": parts["training"],
+        **{f"peers of {peer}": parts["peers"] / len(peers) for peer in peers},
+        "agreement": parts["agreement"],
+    }
 
 
 def _part_of(part: str) -> str:
     """The part of `durations` that a part of a front end belongs to."""
     last = part.rpartition(".")[2]
-    if last in ("mapping", "final", "model"):
+    if last in GAUSSIANS or last == "model":
         return last
     return PARTS.get(part, "tracking" if part == "tracking" else "poses")
 

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.queues import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
+from duagc.pipeline.base import worker_reports
 from duagc.pipeline.base.checkpoints import Shown, StepReport
+from duagc.pipeline.base.worker_reports import Hear
 
 if TYPE_CHECKING:
     from duagc.pipeline.viewing.follow import Follower
 
 EVERY_S = 0.5
-Step = tuple[str, str, int, int]
-"""Of a front end: robot, part, steps done, steps in all; 0 of 0: it is done."""
-_queues: list[SimpleQueue[Step | None]] = []
 
 
 @dataclass(frozen=True)
@@ -27,11 +24,11 @@ class Watch:
     """Hears of the steps of a run in one process.
 
     Attributes:
-        tell: gets steps of front ends.
+        tell: gets steps of front ends, and of the evaluation.
         follower: shows them in Rerun; None: nobody follows.
     """
 
-    tell: Callable[[Step], None] = lambda step: None
+    tell: Hear = lambda step: None
     follower: Follower | None = None
 
     def frontend(self, robot: str, number: int) -> StepReport:
@@ -70,43 +67,11 @@ def in_worker(where: Any) -> Watch:
     Args:
         where: of the server that shows the run; None: nobody follows.
     """
-    tell: Callable[[Step], None] = _queues[0].put if _queues else lambda step: None
     if where is None:
-        return Watch(tell)
+        return Watch(worker_reports.tell)
     from duagc.pipeline.viewing.follow import Follower
 
-    return Watch(tell, Follower.connected(where))
-
-
-def keep_queue(queue: SimpleQueue[Step | None]) -> None:
-    """Where this worker process reports its steps: a queue can be handed to a process only while it starts.
-
-    Args:
-        queue: of the process that started it.
-    """
-    _queues.append(queue)
-
-
-@contextmanager
-def listening(hear: Callable[[Step], None]) -> Iterator[SimpleQueue[Step | None]]:
-    """A queue for worker processes; what they tell is heard in a thread while the block runs.
-
-    Args:
-        hear: gets every step.
-    """
-    queue: SimpleQueue[Step | None] = multiprocessing.get_context("spawn").SimpleQueue()
-
-    def relay() -> None:
-        while (step := queue.get()) is not None:
-            hear(step)
-
-    relaying = threading.Thread(target=relay, daemon=True)
-    relaying.start()
-    try:
-        yield queue
-    finally:
-        queue.put(None)
-        relaying.join(timeout=5.0)
+    return Watch(worker_reports.tell, Follower.connected(where))
 
 
 @contextmanager

@@ -42,7 +42,7 @@ class Simulated:
             if part == "poses":
                 steps.append((at, (robot, "keyframes", keyframes, keyframes)))
             name = part if part == "tracking" else f"{robot}.{part}"
-            count = STEPS.get(part, 3)
+            count = 0 if part == "start" else STEPS.get(part, 3)
             steps += [(at + took * (k + 1) / count, (robot, name, k + 1, count)) for k in range(count)]
             at += took
         at += inflation * durations.information_s(size)
@@ -56,7 +56,7 @@ class Simulated:
             made = self.front_end(robot, begin)
             free[free.index(begin)] = made[-1][0]
             steps += made
-        for self.now, step in sorted(steps):
+        for self.now, step in sorted(steps, key=lambda timed: timed[0]):
             self.times.step(*step)
             self.said.append((self.now, self.times.left_s()))
         for stage, seconds in list(self.times._later):
@@ -95,9 +95,21 @@ def test_a_front_end_that_goes_on_is_not_taken_for_a_fast_one() -> None:
     for fresh.now, step in steps[:200]:
         fresh.times.step(*step)
     for now, step in steps[190:200]:
-        resumed.now = now - steps[190][0]
+        resumed.now = durations.START_S + now - steps[190][0]
         resumed.times.step(*step)
     assert resumed.times.left_s() == pytest.approx(fresh.times.left_s(), rel=0.05)
+
+
+def test_an_evaluation_that_is_slow_shows_while_it_is_at_work() -> None:
+    simulated = Simulated(2, 2, 1.0, 1.0)
+    predicted = dict(simulated.times._later)["evaluation"]
+    simulated.times.begin("evaluation")
+    before = simulated.times.left_s()
+    for step in range(1, 11):
+        simulated.now = step * 0.1 * predicted  # after the predicted time a third of it is done, or less
+        for robot in ("robot0", "robot1"):
+            simulated.times.step(robot, f"held_out of {robot}", 3 * step, 40)
+    assert simulated.times.left_s() > before
 
 
 def test_a_line_says_where_the_robots_are() -> None:

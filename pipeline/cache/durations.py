@@ -14,28 +14,30 @@ from duagc.pipeline.config.mapping import MappingConfig
 
 Size = Mapping[str, int]
 """`frames`, `pixels` of an image and `keyframes` of a robot; `moved`: 1 if depth is of other times than color."""
-TRACKING_S, POSES_S, MODEL_S = (0.004, 0.030), (0.008, 0.036), (0.001, 0.063)
+TRACKING_S, POSES_S, MODEL_S = (0.004, 0.027), (0.006, 0.028), (0.001, 0.060)
 """Of a frame: in any case, and for every million pixels."""
-MOVED_S = 0.35
+MOVED_S = 0.17
 """Of moving the depth of a frame, for every million pixels; a frame is read three times."""
-MAPPING_S = (0.002, 0.143)
+MAPPING_S = (0.006, 0.085)
 """The same of a step of mapping, of which every keyframe takes some."""
-FINAL_S = (0.002, 0.128)
+FINAL_S = (0.006, 0.085)
 """The same of a step of the final optimization."""
 START_S = 2.0
 """Of a process."""
 INFORMATION_S = 0.020
 """Of a frame, for every million pixels."""
-FUSION_S = (3.0, 67.0)
-"""Of a robot that has peers: in any case, and for every million pixels of an image."""
-SCORED_S, COMPARED_S = 0.34, 0.90
-"""Of a render that is scored, and of a view that is compared with the others, for every million pixels."""
+FUSION_S = 3.0
+"""Of a robot that has peers."""
+FUSED_VIEW_S = (0.20, 0.90)
+"""Of a view that its fused map is trained on: in any case, and for every million pixels."""
+SCORED_S, COMPARED_S = (0.047, 0.09), (0.12, 0.50)
+"""The same of a render that is scored, and of a view that is compared with the others."""
 VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
 RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
 """Maps that are drawn at a held-out view, at a keyframe, and at a view of a peer."""
-EXCHANGE_S = 5.5
-"""Of a pair of robots, and of the team."""
+EXCHANGE_S = (2.5, 9.0)
+"""Of a robot that has peers: in any case, and for every million pixels."""
 READERS_S = 6.0
 """Report and view."""
 SERIAL = 0.15
@@ -52,13 +54,15 @@ def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
     megapixels, frames, keyframes = size["pixels"] * 1e-6, size["frames"], size["keyframes"]
 
     def of(cost: tuple[float, float]) -> float:
-        return cost[0] + cost[1] * megapixels
+        return _of_pixels(cost, size)
 
     moved = MOVED_S * megapixels * frames if size.get("moved") else 0.0
-    views = keyframes + min(mapping.support_views, max(frames - keyframes, 0))
-    steps = max(mapping.final_iterations * keyframes, mapping.final_iterations_view * views)
+    steps = max(
+        mapping.final_iterations * keyframes, mapping.final_iterations_view * _trained_views(size, mapping)
+    )
     return {
-        "tracking": START_S + of(TRACKING_S) * frames + (of(TRACKING_S) * frames + moved if moved else 0.0),
+        "start": START_S,
+        "tracking": of(TRACKING_S) * frames + (of(TRACKING_S) * frames + moved if moved else 0.0),
         "poses": of(POSES_S) * frames + moved,
         "mapping": of(MAPPING_S) * mapping.iterations * keyframes,
         "final": of(FINAL_S) * min(steps, mapping.final_iterations_max),
@@ -91,7 +95,25 @@ def fusion_s(size: Size) -> float:
     Args:
         size: of its log.
     """
-    return FUSION_S[0] + FUSION_S[1] * size["pixels"] * 1e-6
+    view_s = _of_pixels(FUSED_VIEW_S, size) + (MOVED_S * size["pixels"] * 1e-6 if size.get("moved") else 0.0)
+    return FUSION_S + view_s * _trained_views(size, MappingConfig())
+
+
+def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
+    """Time of the parts of the evaluation of a robot.
+
+    Args:
+        size: of its log.
+        robots: of the team, with itself; its maps are drawn at the views of the others.
+    """
+    views, keyframes = min(VIEWS, size["frames"] / HELD_OUT), min(VIEWS, size["keyframes"])
+    scored_s, compared_s = _of_pixels(SCORED_S, size), _of_pixels(COMPARED_S, size)
+    return {
+        "held_out": scored_s * RENDERS * views,
+        "training": scored_s * KEYFRAME_RENDERS * keyframes,
+        "peers": scored_s * PEER_RENDERS * views if robots > 1 else 0.0,
+        "agreement": compared_s * views,
+    }
 
 
 def evaluation_s(size: Size, robots: int) -> float:
@@ -99,20 +121,18 @@ def evaluation_s(size: Size, robots: int) -> float:
 
     Args:
         size: of its log.
-        robots: of the team, with itself; its maps are drawn at the views of the others.
+        robots: of the team, with itself.
     """
-    views, keyframes = min(VIEWS, size["frames"] / HELD_OUT), min(VIEWS, size["keyframes"])
-    drawn = RENDERS * views + KEYFRAME_RENDERS * keyframes + (PEER_RENDERS * views if robots > 1 else 0)
-    return size["pixels"] * 1e-6 * (SCORED_S * drawn + COMPARED_S * views)
+    return sum(evaluation_parts(size, robots).values())
 
 
-def exchange_s(robots: int) -> float:
+def exchange_s(sizes: Sequence[Size]) -> float:
     """Time of the exchange of a team.
 
     Args:
-        robots: how many.
+        sizes: of the logs of its robots.
     """
-    return EXCHANGE_S * (1 + robots * (robots - 1) / 2) if robots > 1 else 0.0
+    return sum(_of_pixels(EXCHANGE_S, size) for size in sizes) if len(sizes) > 1 else 0.0
 
 
 def side_by_side_s(begun: Iterable[float], waiting: Sequence[float], workers: int) -> float:
@@ -139,6 +159,15 @@ def threaded_s(seconds: float, processors: int) -> float:
         processors: of the machine; threads of a core count each.
     """
     return seconds * (SERIAL + (1 - SERIAL) / processors)
+
+
+def _of_pixels(cost: tuple[float, float], size: Size) -> float:
+    return cost[0] + cost[1] * size["pixels"] * 1e-6
+
+
+def _trained_views(size: Size, mapping: MappingConfig) -> int:
+    """Keyframes and other frames that a map is trained on."""
+    return size["keyframes"] + min(mapping.support_views, max(size["frames"] - size["keyframes"], 0))
 
 
 def slowdown(workers: int, processors: int) -> float:

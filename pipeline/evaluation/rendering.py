@@ -133,14 +133,14 @@ def robot_scores(
     own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
 
     def score(task: RenderTask, view_set: str, title: str) -> None:
-        name = f"{view_set} of {task.camera_robot.robot}"
+        name, total = f"{view_set} of {task.camera_robot.robot}", len(task.chosen())
 
         def scored() -> list[Scored]:
             views_done: list[dict[str, Scored]] = (save.resume(name) or (0, []))[1]
             rest = task.scores(source, threads, title if progress else None, skip=len(views_done))
             for index, scores in rest:
                 views_done.append({kind: (kind, view_set, index, score) for kind, score in scores.items()})
-                save.at(name, len(views_done), task.most, lambda: views_done)
+                save.at(name, len(views_done), total, lambda: views_done)
             return [row for view in views_done for row in view.values()]
 
         found.extend(save.done(name, scored))
@@ -229,15 +229,19 @@ class RenderTask:
     depth: DepthKind
     most: int = MOST_VIEWS
 
+    def chosen(self) -> list[int]:
+        """Frames of the set, evenly spread, in order."""
+        keyframes = {k.frame_index for k in self.camera_robot.keyframes}
+        frames_of_set = sorted(self.camera_robot.held_out if self.view_set == "held_out" else keyframes)
+        count = min(self.most, len(frames_of_set))
+        return [frames_of_set[k] for k in evenly_spaced(len(frames_of_set), count)]
+
     def scores(
         self, source: Recording, threads: int, title: str | None, *, skip: int = 0
     ) -> Iterator[tuple[int, dict[str, views.ViewScore | Absent]]]:
         """Frame index and the maps' scores of every view but the first `skip`, in order; progress under `title`."""
         name, robot = self.camera_robot.robot, self.camera_robot
-        keyframes = {k.frame_index for k in robot.keyframes}
-        frames_of_set = sorted(robot.held_out if self.view_set == "held_out" else keyframes)
-        count = min(self.most, len(frames_of_set))
-        chosen = [frames_of_set[k] for k in evenly_spaced(len(frames_of_set), count)][skip:]
+        chosen = self.chosen()[skip:]
         with open_rgbd(source.log(name)) as log:
             log.move_depth_by(robot.folder / "frontend.mcap")
             stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from duagc.pipeline.base import determinism
-from duagc.pipeline.base.checkpoints import Checkpoints
+from duagc.pipeline.base import determinism, worker_reports
+from duagc.pipeline.base.checkpoints import Checkpoints, Shown
+from duagc.pipeline.base.worker_reports import Hear
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.evaluation import groundtruth, map_agreement, map_errors, uncertainty_calibration
 from duagc.pipeline.evaluation.rendering import Scored, poses_by_stamp, robot_scores
@@ -67,10 +68,18 @@ class RobotTask:
         determinism.configure_opencv()
         with EVALUATION.running(self.run_dir):
             run, source = RunFolder(self.run_dir), Recording(self.recording)
-            return self.of(name, run, source, truth=TruePaths.of(run, source), longer=longer)
+            truth = TruePaths.of(run, source)
+            return self.of(name, run, source, truth=truth, longer=longer, hear=worker_reports.tell)
 
     def of(
-        self, name: str, run: RunFolder, source: Recording, *, truth: TruePaths, longer: Gaussians | None
+        self,
+        name: str,
+        run: RunFolder,
+        source: Recording,
+        *,
+        truth: TruePaths,
+        longer: Gaussians | None,
+        hear: Hear,
     ) -> RobotMeasures:
         """In this process.
 
@@ -80,8 +89,14 @@ class RobotTask:
             source: its recording.
             truth: paths next to the true ones.
             longer: its own map, trained longer; None: there is none.
+            hear: gets every step.
         """
-        robot, save = run.robots[name], Checkpoints(None if self.saved is None else self.saved / name)
+
+        def report(part: str, done: int, total: int, shown: Shown | None) -> None:
+            hear((name, part, done, total))
+
+        robot = run.robots[name]
+        save = Checkpoints(None if self.saved is None else self.saved / name, report=report)
         scores = robot_scores(
             run,
             source,
@@ -93,7 +108,9 @@ class RobotTask:
             save=save,
         )
         calibration, rows = save.done("calibration", lambda: _calibration_of(robot, source, truth))
+        hear((name, "agreement", 0, 1))
         agreement = save.done("agreement", lambda: _agreement_section(robot, source, truth))
+        hear((name, "agreement", 1, 1))
         return RobotMeasures(scores, agreement, calibration, rows)
 
 
@@ -105,6 +122,7 @@ def measured(
     *,
     workers: int,
     own_longer: Mapping[str, Gaussians],
+    hear: Hear,
 ) -> dict[str, RobotMeasures]:
     """Every robot, by name.
 
@@ -115,12 +133,17 @@ def measured(
         truth: paths next to the true ones.
         workers: robots measured at the same time, in processes of their own if more than one.
         own_longer: own maps trained longer, by robot.
+        hear: gets every step, in another thread where there are other processes.
     """
     if min(workers, len(run.robots)) == 1:
         return {
-            name: task.of(name, run, source, truth=truth, longer=own_longer.get(name)) for name in run.robots
+            name: task.of(name, run, source, truth=truth, longer=own_longer.get(name), hear=hear)
+            for name in run.robots
         }
-    with worker_pool(min(workers, len(run.robots))) as pool:
+    with (
+        worker_reports.listening(hear) as queue,
+        worker_pool(min(workers, len(run.robots)), worker_reports.keep_queue, (queue,)) as pool,
+    ):
         begun = {name: pool.submit(task.in_worker, name, own_longer.get(name)) for name in run.robots}
         return {name: result.result() for name, result in begun.items()}
 

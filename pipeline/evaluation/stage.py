@@ -11,6 +11,7 @@ import numpy as np
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.worker_reports import Hear
 from duagc.pipeline.evaluation import (
     cameras,
     coverage,
@@ -84,6 +85,7 @@ def evaluate(
     own_longer: Mapping[str, Gaussians] | None = None,
     most_views: int = MOST_VIEWS,
     saved: Path | None = None,
+    hear: Hear = lambda step: None,
 ) -> dict[str, Any]:
     """Measure a run against its recording and write metrics.json and metrics.parquet into its folder.
 
@@ -98,6 +100,7 @@ def evaluate(
         most_views: of a set that maps are scored at, evenly spread.
         saved: folder of the parts that are done, from which a process goes on that follows one that was killed;
             None: nothing is saved.
+        hear: gets steps; changes nothing.
 
     Returns:
         The content of metrics.json.
@@ -112,7 +115,7 @@ def evaluate(
     truth, session = TruePaths.of(run, source), Session(run)
     longer, rows = own_longer or {}, list[Row]()
     task = RobotTask(Path(run_dir), Path(recording), threads, progress, most_views, saved)
-    of_robots = measured(task, run, source, truth, workers=workers, own_longer=longer)
+    of_robots = measured(task, run, source, truth, workers=workers, own_longer=longer, hear=hear)
     rendering = rendering_sections({name: m.scores for name, m in of_robots.items()}, longer=bool(longer))
     tree = {
         "schema": METRICS_SCHEMA,

@@ -13,6 +13,7 @@ import pytest
 
 from duagc.pipeline.base import checkpoints
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.worker_reports import Step
 from duagc.pipeline.cli.runs import evaluate as evaluate_command
 from duagc.pipeline.evaluation import evaluate, robot_measures
 from duagc.pipeline.evaluation import views as scored_views
@@ -337,6 +338,15 @@ def test_threads_change_no_bit(fake, metrics, tmp_path):
     before = {name: (fake.run / name).read_bytes() for name in ("metrics.json", "metrics.parquet")}
     evaluate(fake.run, fake.recording, threads=1, progress=False)
     assert {name: (fake.run / name).read_bytes() for name in before} == before
+
+
+def test_it_says_how_far_it_is_with_every_robot(fake, metrics):
+    steps = list[Step]()
+    assert evaluate(fake.run, fake.recording, progress=False, workers=2, hear=steps.append) == metrics
+    for robot in metrics["robots"]:
+        parts = [part for name, part, done, total in steps if name == robot and done == total]
+        peers = [f"peers of {other}" for other in metrics["robots"] if other != robot]
+        assert parts == [f"held_out of {robot}", f"training of {robot}", *peers, "agreement"]
 
 
 def test_own_maps_are_trained_longer_only_if_asked(metrics, tmp_path):

@@ -1,0 +1,56 @@
+"""What worker processes report to the process that started them, while they are at work."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.queues import SimpleQueue
+
+Step = tuple[str, str, int, int]
+"""Of a robot: its name, what is done of it, steps done, steps in all; 0 of 0: it is done."""
+Hear = Callable[[Step], None]
+"""Gets steps."""
+_queues: list[SimpleQueue[Step | None]] = []
+
+
+def keep_queue(queue: SimpleQueue[Step | None]) -> None:
+    """Where this worker process reports its steps: a queue can be handed to a process only while it starts.
+
+    Args:
+        queue: of the process that started it.
+    """
+    _queues.append(queue)
+
+
+def tell(step: Step) -> None:
+    """Report a step to the process that started this one, if it listens.
+
+    Args:
+        step: of a robot.
+    """
+    if _queues:
+        _queues[0].put(step)
+
+
+@contextmanager
+def listening(hear: Hear) -> Iterator[SimpleQueue[Step | None]]:
+    """A queue for worker processes; what they tell is heard in a thread while the block runs.
+
+    Args:
+        hear: gets every step.
+    """
+    queue: SimpleQueue[Step | None] = multiprocessing.get_context("spawn").SimpleQueue()
+
+    def relay() -> None:
+        while (step := queue.get()) is not None:
+            hear(step)
+
+    relaying = threading.Thread(target=relay, daemon=True)
+    relaying.start()
+    try:
+        yield queue
+    finally:
+        queue.put(None)
+        relaying.join(timeout=5.0)
