@@ -129,13 +129,14 @@ class Chain:
             inputs |= {f"{part} of {name}": digest for part, digest in _own(name, robot).items()}
         return carrier.carry(stages.EXCHANGE, None, inputs, meet)
 
-    def fusion(self, name: str, robot: Prepared, exchange: Carried) -> Carried:
+    def fusion(self, name: str, robot: Prepared, exchange: Carried, *, threads: int) -> Carried:
         """The fused map of one robot.
 
         Args:
             name: of the robot.
             robot: with its own results.
             exchange: of the team.
+            threads: of the kernels; changes no bit of the result.
         """
         log, carrier = self._recording.log(name), self._carrier
         folder = carrier.folder / "robots" / name
@@ -146,7 +147,7 @@ class Chain:
             settings = carrier.settings_of(stages.FUSION)
             checkpoints = carrier.checkpoints(carrier.key(stages.FUSION, name, inputs))
             with timing.stage(stages.FUSION, folder, name):
-                result = steps.fusion(name, log, folder, settings, checkpoints=checkpoints)
+                result = steps.fusion(name, log, folder, settings, threads=threads, checkpoints=checkpoints)
             timing.went_on(label("fusion", name), *checkpoints.before_s)
             return result
 

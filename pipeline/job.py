@@ -22,7 +22,7 @@ from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.chain import Chain, Prepared
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.preparation import Preparation, Say, carrier_of, workers_that_fit
+from duagc.pipeline.preparation import RobotProcesses, Say, carrier_of, workers_that_fit
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
@@ -34,6 +34,7 @@ from duagc.pipeline.watch import Watch, ticking
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 READER_SHARE = 2.0  # memory of the evaluation of a robot, relative to its preparation
+FUSION_SHARE = 1.5  # the same of its fusion
 READERS = (stages.EVALUATION.name, stages.REPORT.name, stages.VIEW.name)
 TITLES = {
     stages.CALIBRATION.name: "calibration",
@@ -216,18 +217,37 @@ class Job:
             raise
 
     def _fused(self, chain: Chain, prepared: dict[str, Prepared], exchange: Carried) -> list[Carried]:
-        done = []
+        """The fused map of every robot; `workers` at a time in processes of their own."""
+        looking = Chain(self.recording, self._looking_carrier(), self.digests)
+        found, absent = dict[str, Carried](), list[str]()
         for name, robot in prepared.items():
             try:
-                done.append(self._noted(chain.fusion, name, robot, exchange))
-            except NotStoredError:
-                continue
-            if not self.carrier.looking:
-                for neighbor, reason in done[-1].entry.result["left_out"].items():
-                    self.log(f"warning: {name} uses nothing of {neighbor}'s map: {reason}")
-        if self.missing:
-            raise NotStoredError(self.missing[0])
+                found[name] = looking.fusion(name, robot, exchange, threads=1)
+            except NotStoredError as error:
+                self.missing.append(error.key)
+                absent.append(name)
+        if self.carrier.looking:
+            if absent:
+                raise NotStoredError(self.missing[0])
+            return list(found.values())
+        self.missing.clear()
+        workers, fused = self._fitting(self._sizes(absent), FUSION_SHARE), dict[str, Carried]()
+        if workers > 1:
+            self.log(f"fusion: {len(absent)} robots, {workers} at a time")
+            if self._time_left is not None:
+                self._time_left.begin(stages.FUSION.name)
+            fused = self._processes().fuse({name: prepared[name] for name in absent}, exchange, workers)
+        threads, done = threads_per_worker(1), []
+        for name, robot in prepared.items():
+            done.append(fused.get(name) or chain.fusion(name, robot, exchange, threads=threads))
+            for neighbor, reason in done[-1].entry.result["left_out"].items():
+                self.log(f"warning: {name} uses nothing of {neighbor}'s map: {reason}")
         return done
+
+    def _processes(self) -> RobotProcesses:
+        return RobotProcesses(
+            self.recording.path, self.folder, self.config, self.plan, self._place, self._where
+        )
 
     def _prepared(self, chain: Chain) -> dict[str, Prepared]:
         """Every robot with its own results, by name; `workers` at a time in processes of their own."""
@@ -254,10 +274,7 @@ class Job:
             self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
             self._check_registration(absent)
             self._time_left = self._expected(sizes, found, workers)
-            preparation = Preparation(
-                self.recording.path, self.folder, self.config, self.plan, self._place, self._where
-            )
-            found |= preparation.run(absent, workers, alone=alone, hear=self._hear)
+            found |= self._processes().prepare(absent, workers, alone=alone, hear=self._hear)
         else:
             self.log(f"front end and information: {len(found)} robots from the store")
             self._time_left = self._expected({}, found, self.plan.workers)

@@ -1,10 +1,10 @@
-"""The robots of a run that have no results yet: prepared in processes of their own, as many as fit into memory."""
+"""Stages of robots that have no results yet, in processes of their own, as many as fit into memory."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from duagc.pipeline import steps, watch
 from duagc.pipeline.base import worker_reports
 from duagc.pipeline.base.machine import memory_bytes
 from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.cache.carrier import Carrier
+from duagc.pipeline.cache.carrier import Carried, Carrier
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.footprint import fitting, robot_bytes
 from duagc.pipeline.cache.stage_key import StageKey
@@ -110,8 +110,8 @@ def workers_that_fit(
 
 
 @dataclass(frozen=True)
-class Preparation:
-    """Front end and information of robots, each by one of some processes.
+class RobotProcesses:
+    """Stages of robots, each robot by one of some processes.
 
     Attributes:
         recording: that the run is of.
@@ -129,10 +129,10 @@ class Preparation:
     place: Path
     where: Any = None
 
-    def run(
+    def prepare(
         self, robots: Sequence[str], workers: int, *, alone: bool, hear: worker_reports.Hear
     ) -> dict[str, Prepared]:
-        """Prepare robots; by name of the component.
+        """Front end and information of robots; by name of the component.
 
         Args:
             robots: their names.
@@ -146,30 +146,60 @@ class Preparation:
             worker_reports.listening(hear) as queue,
             worker_pool(workers, worker_reports.keep_queue, (queue,)) as pool,
         ):
-            tasks = [pool.submit(self.prepare, robot, threads=threads, alone=alone) for robot in robots]
+            tasks = [pool.submit(self.prepare_one, robot, threads=threads, alone=alone) for robot in robots]
             for task in tasks:
                 found |= task.result()
         return found
 
-    def prepare(self, robot: str, *, threads: int, alone: bool) -> dict[str, Prepared]:
-        """One robot, in a process of its own.
+    def prepare_one(self, robot: str, *, threads: int, alone: bool) -> dict[str, Prepared]:
+        """Front end and information of one robot, in a process of its own.
 
         Args:
             robot: its name.
             threads: of the kernels; changes no bit.
             alone: leave the information out.
         """
-
-        def log(line: str) -> None:
-            say(f"duagc: {line}")
-
         heard = watch.in_worker(self.where)
-        carrier = carrier_of(self.folder, self.config, self.plan, log=log, place=self.place)
-        digests = FileDigests(None) if carrier.store is None else carrier.store.files
         try:
-            chain = Chain(Recording(self.recording), carrier, digests, heard)
-            return chain.robot(robot, threads=threads, alone=alone)
+            return self._chain(heard).robot(robot, threads=threads, alone=alone)
         finally:
             heard.tell((robot, "", 0, 0))
             if heard.follower is not None:
                 heard.follower.close()
+
+    def fuse(self, robots: Mapping[str, Prepared], exchange: Carried, workers: int) -> dict[str, Carried]:
+        """The fused maps of robots, by name.
+
+        Args:
+            robots: with their own results, by name.
+            exchange: of the team.
+            workers: how many at the same time.
+        """
+        threads = steps.threads_per_worker(workers)
+        with worker_pool(workers) as pool:
+            tasks = {
+                name: pool.submit(self.fuse_one, name, robot, exchange, threads=threads)
+                for name, robot in robots.items()
+            }
+            return {name: task.result() for name, task in tasks.items()}
+
+    def fuse_one(self, name: str, robot: Prepared, exchange: Carried, *, threads: int) -> Carried:
+        """The fused map of one robot, in a process of its own.
+
+        Args:
+            name: of the robot.
+            robot: with its own results.
+            exchange: of the team.
+            threads: of the kernels; changes no bit.
+        """
+        return self._chain(watch.UNWATCHED).fusion(name, robot, exchange, threads=threads)
+
+    def _chain(self, heard: watch.Watch) -> Chain:
+        """The stages, in a process that knows nothing of the run yet."""
+
+        def log(line: str) -> None:
+            say(f"duagc: {line}")
+
+        carrier = carrier_of(self.folder, self.config, self.plan, log=log, place=self.place)
+        digests = FileDigests(None) if carrier.store is None else carrier.store.files
+        return Chain(Recording(self.recording), carrier, digests, heard)

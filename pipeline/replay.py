@@ -106,7 +106,7 @@ def _replay_one(
     )
     report(f"{robot}: fusion")
     with stages.FUSION.running(folder, robot):
-        steps.fuse_robot(robot, log, folder, result, config=config)
+        steps.fuse_robot(robot, log, folder, result, config=config, threads=steps.threads_per_worker(1))
     comparisons = [Comparison(robot, "packets sent", sent.recorded, sent.recomputed)]
     for name in ROBOT_RESULTS:
         recorded = digest_file(run / "robots" / robot / name)

@@ -192,7 +192,7 @@ def exchange(
 
 
 def fusion(
-    robot: str, log: Path, folder: Path, config: RunConfig, *, checkpoints: Checkpoints
+    robot: str, log: Path, folder: Path, config: RunConfig, *, threads: int, checkpoints: Checkpoints
 ) -> dict[str, Any]:
     """Fused map and corrected trajectory of one robot, from what it took home.
 
@@ -201,6 +201,7 @@ def fusion(
         log: of its sensors.
         folder: of its own results.
         config: of the run.
+        threads: of the kernels; changes no bit of the result.
         checkpoints: from which it goes on, and to which it saves; they change no bit of the result.
 
     Returns:
@@ -209,7 +210,7 @@ def fusion(
     from duagc.pipeline.runs.session_file import NAME, read_session_result
 
     result = read_session_result(folder / NAME)
-    left_out = fuse_robot(robot, log, folder, result, config=config, checkpoints=checkpoints)
+    left_out = fuse_robot(robot, log, folder, result, config=config, threads=threads, checkpoints=checkpoints)
     return {"left_out": left_out, "robots": len(result.component)}
 
 
@@ -220,9 +221,10 @@ def fuse_robot(
     result: SessionResult,
     *,
     config: RunConfig,
+    threads: int,
     checkpoints: Checkpoints | None = None,
 ) -> dict[str, str]:
-    """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time.
+    """Fused map and corrected trajectory of one robot, into the folder of its own results.
 
     Returns:
         Neighbors of whose maps nothing is used, and why.
@@ -239,7 +241,7 @@ def fuse_robot(
         moving=config.frontend.moving,
         weights=config.exchange.weights,
         seed=config.seed,
-        threads=threads_per_worker(1),
+        threads=threads,
         checkpoints=checkpoints,
     )
     return {check.peer: check.reason for check in checks if not check.trusted}

@@ -74,17 +74,19 @@ class TimeLeft:
         return parts | {"information": durations.information_s(size)}
 
     def _predict_later(self) -> None:
-        """What follows the front ends, in order: stages, and predicted seconds; fusion robot by robot."""
+        """What follows the front ends, in order: stages, and predicted seconds; fusion robot by robot, or of all."""
         team, reading = self._sizes | self._found, self._reading
         works = {name: RobotWork(_evaluation(name, size, list(team)), UNHEARD) for name, size in team.items()}
         one_s, many = durations.threaded_s(1.0, processors()), durations.slowdown(reading, processors())
-        self._evaluation = RobotsWork(works, reading, one_s if reading == 1 else many, self._clock())
         sizes = list(team.values())
-        fused_s = [durations.threaded_s(durations.fusion_s(s), processors()) for s in sizes]
-        fused = [(stages.FUSION, seconds) for seconds in fused_s] if len(sizes) > 1 else []
+        slower = one_s if reading == 1 else many
+        self._evaluation = RobotsWork(works, reading, slower, self._clock())
+        fused_s = [slower * durations.fusion_s(s) for s in sizes] if len(sizes) > 1 else []
+        if reading > 1:
+            fused_s = [durations.side_by_side_s((), fused_s, reading)]
         expected = [
             (stages.EXCHANGE, durations.exchange_s(sizes)),
-            *fused,
+            *((stages.FUSION, seconds) for seconds in fused_s),
             (stages.EVALUATION, self._evaluation.predicted_s()),
             (stages.REPORT, durations.READERS_S / 2),
             (stages.VIEW, durations.READERS_S / 2),

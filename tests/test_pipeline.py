@@ -133,7 +133,7 @@ def exchanged_again(run_folder: Path, recording: Path, out: Path, *overrides: st
         consensus_path=out / "consensus.mcap",
     )
     for robot, log in logs.items():
-        fuse_robot(robot, log, out / "robots" / robot, results[robot], config=config)
+        fuse_robot(robot, log, out / "robots" / robot, results[robot], config=config, threads=2)
     return out
 
 
@@ -519,7 +519,7 @@ def test_a_fusion_that_is_killed_goes_on_with_the_same_bits(
         place = folder / "killed_fusion" / "checkpoints"
         save = Checkpoints(place, every_s=0.0, largest_share=math.inf, say=said.append, report=report)
         with suppress(KilledError):
-            fuse_robot("alpha", log, robot, result, config=config, checkpoints=save)
+            fuse_robot("alpha", log, robot, result, config=config, threads=2, checkpoints=save)
             assert report is None
     assert len(said) == 1
     assert said[0].startswith("training: goes on at ")

@@ -56,8 +56,7 @@ def estimate(
     seconds += side_by_side_s("evaluation", (durations.evaluation_s(row, len(rows)) for row in rows))
     if len(rows) > 1:
         seconds += durations.exchange_s(rows)
-        fused_s = ratios.get("fusion", 1.0) * sum(map(durations.fusion_s, rows))
-        seconds += durations.threaded_s(fused_s, WORKERS)
+        seconds += side_by_side_s("fusion", map(durations.fusion_s, rows))
     size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
     return {"seconds_from": RANGE[0] * seconds, "seconds_to": RANGE[1] * seconds, "bytes": float(size)}
 

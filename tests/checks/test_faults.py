@@ -217,7 +217,7 @@ def test_a_run_says_before_it_begins_that_depth_is_of_another_time(
     def stop(*args: Any, **kwargs: Any) -> Any:
         raise DuagError("stopped")
 
-    monkeypatch.setattr(job.Preparation, "run", stop)
+    monkeypatch.setattr(job.RobotProcesses, "prepare", stop)
     recording = Recording(planted(sound, tmp_path / "rec", change))
     lines: list[str] = []
     plan = RunPlan(workers=1, calibrate=calibrate)
