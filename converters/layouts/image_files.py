@@ -37,7 +37,7 @@ def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str, NDArray[n
     import cv2
 
     data = read_bytes(path, "a color image")
-    image = decode_image(data, cv2.IMREAD_COLOR)
+    image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a color image")
     check_size(path, image.shape, size)

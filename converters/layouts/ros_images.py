@@ -106,7 +106,7 @@ def size_of(message: Any, where: str) -> tuple[int, int]:
     if is_depth(message):
         height, width = depth_m(message, where, 1.0).shape
         return width, height
-    image = decode_image(color_bytes(message, where)[0], cv2.IMREAD_COLOR)
+    image = decode_image(color_bytes(message, where)[0], cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DuagError(f"{where}: no decoder reads it, expected a color image")
     return int(image.shape[1]), int(image.shape[0])

@@ -190,3 +190,15 @@ def test_cameras_that_cannot_be_are_refused(K: list[float], message: str) -> Non
     object.__setattr__(info, "k", np.array(K))
     with pytest.raises(DuagError, match=message):
         ros_images.RosCamera.of(info, False, "here")
+
+
+def test_the_orientation_in_a_jpeg_turns_no_image() -> None:
+    """A camera that writes how it was held: intrinsics are those of the pixels as they are stored."""
+    data = cv2.imencode(".jpg", np.zeros((30, 40, 3), np.uint8))[1].tobytes()
+    entry = struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0)  # a quarter turn
+    tiff = b"MM\x00*" + struct.pack(">IH", 8, 1) + entry + bytes(4)
+    body = b"Exif\x00\x00" + tiff
+    turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:]
+    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (40, 30, 3)
+    message = Ros(2).compressed(0, "camera", turned, "jpeg")
+    assert ros_images.size_of(message, "here") == (40, 30)
