@@ -157,6 +157,12 @@ class RecordingWriter:
     def _finish(self) -> None:
         if not self._robots:
             raise DuagError(f"{self.out}: found no robot, expected at least one")
+        for robot, row in self.checks.items():
+            if row.get("rough"):
+                self.warnings.append(
+                    f"{robot}: depth moved by its true poses differs by {row['reprojection_median_m']:.3f} m at "
+                    f"{row['median_depth_m']:.2f} m (medians): they are rough, and so are errors against them"
+                )
         unknown = sorted(set(USER_MASKS.get() or {}) - {ALL_ROBOTS} - set(self._robots))
         if unknown:
             names = ", ".join(sorted(self._robots))

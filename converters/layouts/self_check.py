@@ -17,6 +17,7 @@ PAIRS = 8
 STRIDE = 6  # pixels
 MIN_PIXELS = 200
 MAX_RATIO = 0.02  # of the median depth
+ROUGH = 0.5  # of the difference without a motion, below which poses are right and rough: no other convention does that
 
 
 class ReprojectionCheck:
@@ -32,6 +33,7 @@ class ReprojectionCheck:
         self._second = {start + gap: start for start in starts}  # second frame of a pair -> first
         self._kept: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         self._residuals: list[NDArray[np.float64]] = []
+        self._unmoved: list[NDArray[np.float64]] = []
         self._depths: list[NDArray[np.float64]] = []
 
     def needs(self, index: int, T_world_camera: NDArray[np.float64] | None) -> bool:
@@ -63,24 +65,31 @@ class ReprojectionCheck:
         found, expected = second[v, u], points[index, 2]
         self._residuals.append(np.abs(found - expected)[found > 0])
         self._depths.append(found[found > 0])
+        still = np.abs(second - first)[::STRIDE, ::STRIDE]
+        self._unmoved.append(still[((first > 0) & (second > 0))[::STRIDE, ::STRIDE]])
 
     def result(self, label: str, max_ratio: float = MAX_RATIO) -> dict[str, Any]:
-        """Median residual and median depth in meters, None where too little overlaps.
+        """Median residual and median depth in meters, None where too little overlaps; and whether poses are rough.
 
         Args:
             label: of the source, for the message.
             max_ratio: largest residual as a share of the depth; more where the true poses are known to be
                 rough.
         Raises:
-            DuagError: the residual is too large: poses, depth and intrinsics do not belong together.
+            DuagError: the residual is too large, and not far less than without a motion: poses, depth and intrinsics do
+                not belong together.
         """
         residuals = np.concatenate([*self._residuals, np.zeros(0)])
         if len(residuals) < MIN_PIXELS:
             return {"reprojection_median_m": None, "median_depth_m": None}
         residual, depth = float(np.median(residuals)), float(np.median(np.concatenate(self._depths)))
-        if residual > max_ratio * depth:
+        found: dict[str, Any] = {"reprojection_median_m": residual, "median_depth_m": depth}
+        if residual <= max_ratio * depth:
+            return found
+        unmoved = float(np.median(np.concatenate([*self._unmoved, np.zeros(0)])))
+        if residual > ROUGH * unmoved:
             raise DuagError(
                 f"{label}: depth moved by the poses differs by {residual:.3f} m at {depth:.2f} m (medians), expected "
                 f"less than {max_ratio:.0%}: poses, intrinsics and depth do not belong together"
             )
-        return {"reprojection_median_m": residual, "median_depth_m": depth}
+        return found | {"rough": True}

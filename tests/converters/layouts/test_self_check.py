@@ -1,0 +1,40 @@
+"""Poses that do not belong to the depth are refused; rough ones are told."""
+
+import numpy as np
+import pytest
+
+from duagc.converters.layouts.self_check import ReprojectionCheck
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+CAMERA = PinholeCamera(80, 60, 70.0, 70.0, 39.5, 29.5)
+FRAMES = 30
+
+
+def checked(scale: float) -> ReprojectionCheck:
+    """A camera that goes 5 cm a frame toward a wall at 4 m, by poses that say it goes so many times as far."""
+    check = ReprojectionCheck(CAMERA, FRAMES)
+    for k in range(FRAMES):
+        pose = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, scale * 0.05 * k])
+        if check.needs(k, pose):
+            check.add(k, np.full((60, 80), 4.0 - 0.05 * k), pose)
+    return check
+
+
+def test_right_poses_leave_nothing() -> None:
+    rows = checked(1.0).result("rec")
+    assert rows["reprojection_median_m"] < 1e-9
+    assert "rough" not in rows
+
+
+def test_rough_poses_are_told_and_not_refused() -> None:
+    rows = checked(1.3).result("rec")  # 15 cm of 50, 5 % of the depth
+    assert rows["reprojection_median_m"] == pytest.approx(0.15)
+    assert rows["rough"]
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.0, 0.4, 2.0])
+def test_poses_of_another_convention_are_refused(scale: float) -> None:
+    with pytest.raises(DuagError, match="do not belong together"):
+        checked(scale).result("rec")
