@@ -30,6 +30,7 @@ from duagc.converters.logs.derived import Picture, Sweeps
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import sources_of
+from duagc.converters.logs.unmeasured import farthest_measured_m
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
@@ -129,11 +130,12 @@ def write_robot(
 
 
 def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: int) -> dict[str, Any]:
-    settings, log, pairs, derived = source.settings, source.name, source.pairs, source.derived
+    log, pairs, derived = source.name, source.pairs, source.derived
     readings, rows = _Readings(robot, source), source.check_rows()
     if isinstance(derived, Sweeps):
         robot.set_lidar(derived.lidar.T_camera_lidar, derived.lidar.range_sigma_m)
     check = ReprojectionCheck(source.camera, len(pairs), gap)
+    farthest_m = _farthest_m(source)
     without = empty = far = cut = 0
     written: set[int] = set()
 
@@ -142,8 +144,10 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         if is_cut_short(color) or is_cut_short(depth):
             return stamp_ns, None, 0
         if derived:
-            return stamp_ns, derived.picture(color, depth, stamp_ns, pairs[stamp_ns]), 0
-        return stamp_ns, *_measured(source, stamp_ns, color, depth)
+            partner_ns = pairs[stamp_ns]
+            assert partner_ns is not None  # or there would be nothing to derive depth from
+            return stamp_ns, derived.picture(color, depth, stamp_ns, partner_ns), 0
+        return stamp_ns, *_measured(source, stamp_ns, color, depth, farthest_m=farthest_m)
 
     # what is derived may depend on the frames before
     found = in_order(pictured, source.frames(), threads=1 if derived else None)
@@ -152,8 +156,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
             cut += 1
             continue
         far += beyond
-        T = source.truth.at(stamp_ns, settings.max_pose_gap_s) if source.truth else None
-        T = None if T is None else T @ source.T_color_camera
+        T = source.true_pose(stamp_ns)
         without += T is None
         readings.write_until(stamp_ns)
         at_ns, encoded = source.written_ns(stamp_ns), (picture.color, picture.color_format)
@@ -170,8 +173,9 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         )
         if depth_ns is not None:
             written.add(depth_ns)
-        if check.needs(index, T):
-            check.add(index, source.depth_m(picture), T)
+        if check.needs(index, T) and (picture.depth is not None or derived):
+            at_depth = None if depth_ns is None else source.true_pose(pairs[stamp_ns])
+            check.add(index, source.depth_m(picture), T if at_depth is None else at_depth)
         empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))
     if cut:
         source.warnings.append(f"{cut} frames have color or depth that is cut short; left out")
@@ -184,15 +188,29 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     if source.truth is not None and without:
         source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
     if not isinstance(derived, Sweeps):
-        rows["without_depth"] = empty / max(
-            1, (len(pairs) - cut) * source.camera.width * source.camera.height
-        )
+        with_depth = sum(depth_ns is not None for depth_ns in pairs.values()) - cut
+        rows["without_depth"] = empty / max(1, with_depth * source.camera.width * source.camera.height)
     drift = {} if source.drift is None else {"clock_drift_ppm": 1e6 * source.drift.rate}
     return {**rows, **check.result(log, max_ratio), **_truth_lag(source), **drift}
 
 
-def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[Picture, int]:
-    """The frame of a depth image, and how many pixels are too far away for the log."""
+def _farthest_m(source: RobotLog) -> float:
+    """Distance from which on depth images say nothing, meters; 0: all depth counts."""
+    if source.settings.farthest_m or source.derived is not None:
+        return source.settings.farthest_m
+    found_m, share = farthest_measured_m(source.log, source.depth, source.settings.depth_scale)
+    if found_m:
+        source.warnings.append(
+            f"{share:.0%} of {source.depth} is exactly {found_m:.3f} m, far beyond all other: taken for none; "
+            "expected 0 where nothing was measured"
+        )
+    return found_m
+
+
+def _measured(
+    source: RobotLog, stamp_ns: int, color: Any, depth: Any | None, *, farthest_m: float
+) -> tuple[Picture, int]:
+    """A frame, with depth if there is any, and how many pixels are too far away for the log."""
     import cv2
 
     log, maps = source.name, source.color_maps
@@ -200,14 +218,19 @@ def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[
     data, color_format = color_bytes(color, where)
     _check_size(where, encoded_size(data) or (0, 0), source.camera)
     if maps is not None:
-        image = decode_image(data, cv2.IMREAD_COLOR)
+        image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise DuagError(f"{where}: no decoder reads it, expected a color image")
         data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
         color_format = "png"
+    if depth is None:
+        return Picture(data, color_format), 0
     where = f"{log}: {source.depth} at {stamp_ns} ns"
     values: NDArray[Any] = depth_values(depth, where)
     _check_size(where, (values.shape[1], values.shape[0]), source.depth_camera.camera)
+    if farthest_m:
+        meters = in_meters(values, source.settings.depth_scale)
+        values = np.where(meters < farthest_m, values, values.dtype.type(0))
     if source.depth_maps is not None:
         values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
     if source.keeps_depth and values.dtype == np.uint16:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from duagc.converters.layouts.ros_images import RosCamera, is_integer_depth, size_of
 from duagc.converters.layouts.tum_layout import Listed, associate
 from duagc.converters.layouts.validity import of_maps
+from duagc.converters.logs.camera_watch import CameraWatch
 from duagc.converters.logs.choice import REGISTERED, Chooser, video_words
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
@@ -34,32 +35,7 @@ from duagc.pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
 
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
-SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
 OUT_SCALE = 0.0005  # meters per unit of depth that was registered or came as floats
-
-
-class _Cameras:
-    """Watches that what a CameraInfo says does not change: a camera of the recording is one camera."""
-
-    def __init__(self, first: Mapping[str, tuple[RosCamera, bool]], name: str) -> None:
-        self._first, self._name = first, name
-        self._seen: dict[str, bytes] = {}
-
-    def see(self, entry: Entry) -> None:
-        """Compare a message with the first one. Raises DuagError where the difference can be seen in images."""
-        rest = entry.data[16:]  # in ROS what follows the times of the header, most often the same bytes
-        if self._seen.get(entry.topic) == rest:
-            return
-        self._seen[entry.topic] = rest
-        first, rectified = self._first[entry.topic]
-        where = f"{self._name}: {entry.topic}"
-        now = RosCamera.of(entry.read(), rectified, where)
-        a, b = (np.array([c.camera.fx, c.camera.fy, c.camera.cx, c.camera.cy]) for c in (first, now))
-        if np.abs(a - b).max() > SAME_CAMERA_PX or first.distortion != now.distortion:
-            raise DuagError(
-                f"{where} changes at {entry.log_ns} ns from fx fy cx cy = {a.round(2).tolist()} px to "
-                f"{b.round(2).tolist()}, expected one camera (a zoom or autofocus has to be fixed while recording)"
-            )
 
 
 class RobotLog:
@@ -150,7 +126,8 @@ class RobotLog:
         """The test of the rectification of a stereo pair; nothing for other sources of depth."""
         if not isinstance(self.derived, Stereo):
             return {}
-        groups = [{self.color: c, self.depth: d} for c, d in some_pairs(self.pairs)]
+        pairs = {c: d for c, d in self.pairs.items() if d is not None}
+        groups = [{self.color: c, self.depth: d} for c, d in some_pairs(pairs)]
         found = gathered(self.log, groups, self.time_ns)
         return self.derived.check([(g[self.color].read(), g[self.depth].read()) for g in found])
 
@@ -251,6 +228,13 @@ class RobotLog:
         self._seen  # noqa: B018
         return self._motion.truth()
 
+    def true_pose(self, stamp_ns: int | None) -> Array | None:
+        """T_world_camera [4, 4] of the camera of the recording at a time of the log; None where it is not known."""
+        if self.truth is None or stamp_ns is None:
+            return None
+        T = self.truth.at(stamp_ns, self.settings.max_pose_gap_s)
+        return None if T is None else T @ self.T_color_camera
+
     # --- which messages
 
     def time_ns(self, entry: Entry) -> int:
@@ -277,7 +261,7 @@ class RobotLog:
             delays.append(entry.log_ns - stamps[entry.topic][-1])
             recorded.append(entry.log_ns)
 
-        cameras = _Cameras(self._cameras, self.name)
+        cameras = CameraWatch(self._cameras, self.name)
         takers: list[tuple[str, Callable[[Entry], None]]] = [*self._motion.take]
         takers += [(topic, take_image) for topic in stamps]
         takers += [(topic, cameras.see) for topic in self._cameras]
@@ -313,8 +297,8 @@ class RobotLog:
         return stamp_ns + self.shift_ns + round(self._rate * (stamp_ns - self._origin_ns))
 
     @cached_property
-    def pairs(self) -> dict[int, int]:
-        """Time of a color image -> time of its depth image."""
+    def pairs(self) -> dict[int, int | None]:
+        """Time of a color image -> time of its depth image; None: none is near, and the camera is followed by color."""
         stamps = {topic: times.tolist() for topic, times in self._seen.items()}
         for topic, times in stamps.items():
             if times != sorted(times):
@@ -341,21 +325,25 @@ class RobotLog:
                 f"{self.name}: no image on {self.depth} within {settings.limit_ns / NANOSECONDS:g} s of one on "
                 f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set max_difference_s=SECONDS"
             )
-        alone = len(listed[self.color]) - len(found)
+        pairs: dict[int, int | None] = {c.stamp_ns: d.stamp_ns for c, d in found}
+        alone = [c.stamp_ns for c in listed[self.color] if c.stamp_ns not in pairs]
+        kept = self.derived is None and settings.association == "all"
         if alone:
+            end = "followed by color" if kept else "left out"
             self.warnings.append(
-                f"{alone} of {len(listed[self.color])} color images have no depth near in time; left out"
+                f"{len(alone)} of {len(listed[self.color])} color images have no depth near in time; {end}"
             )
-        if min(c.stamp_ns for c, _ in found) + self.shift_ns < 0:
+        pairs |= dict.fromkeys(alone if kept else ())
+        if min(pairs) + self.shift_ns < 0:
             raise DuagError(f"{self.name}: clock_offset_s = {self.settings.clock_offset_s} leads before 1970")
-        return {c.stamp_ns: d.stamp_ns for c, d in found}
+        return pairs
 
     def depth_stamp_ns(self, stamp_ns: int) -> int | None:
-        """The time of the recording for the depth of a color image; None: it counts as that of the color."""
+        """The time of the recording for the depth of a color image; None: there is none, or it is that of the color."""
         depth_ns = self.pairs[stamp_ns]
         moves = self.derived is None and self.settings.association == "all"
         # what is farther away was allowed by max_difference_s, because the times are wrong
-        if not moves or abs(depth_ns - stamp_ns) > TOLERANCE_NS:
+        if depth_ns is None or not moves or abs(depth_ns - stamp_ns) > TOLERANCE_NS:
             return None
         return self.written_ns(depth_ns)
 
@@ -376,12 +364,18 @@ class RobotLog:
         )
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
-        """Time, color and depth message of every pair, in order of time; holds no more than it must."""
+        """Time, color and depth message (if any) of every frame, in order of time; holds no more than it must."""
         order = sorted(self.pairs)
-        groups = [{self.color: time, self.depth: self.pairs[time]} for time in order]
+        groups = []
+        for time in order:
+            depth_ns = self.pairs[time]
+            groups.append(
+                {self.color: time} if depth_ns is None else {self.color: time, self.depth: depth_ns}
+            )
         # to the end of the log, so that all its checksums are compared
         for index, found in enumerate(gathered(self.log, groups, self.time_ns)):
-            yield order[index], found[self.color].read(), found[self.depth].read()
+            depth = found.get(self.depth)
+            yield order[index], found[self.color].read(), None if depth is None else depth.read()
 
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""

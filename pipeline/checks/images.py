@@ -16,12 +16,14 @@ from duagc.pipeline.checks.findings import Finding, Severity
 from duagc.pipeline.config.checks import ImageChecks
 from duagc.pipeline.messages import unpack_stamp
 from duagc.pipeline.recording import Record, RgbdFrame
+from duagc.pipeline.recording.greatest_depth import greatest_apart
 from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics as topic_table
 
 FEW_FRAMES = 0.1  # of a recording: so many with saturated or far depth are enough to be reported
 SATURATED = 65535  # the largest number of a 16-bit depth image
 BINS = 8  # of a color histogram, per channel
+TAKE_FOR_NONE = "let the converter take it for none; `convert ros`: --set farthest_m=METERS"
 
 
 @dataclass
@@ -89,18 +91,22 @@ class Sight:
         depth_m: percentiles 1, 50, 99 of the known depth, NaN if there is none.
         known: share of the pixels.
         saturated: share of the known depth.
+        greatest_m: depth that is the greatest, and far beyond the next; 0: there is none such.
         depth_of_frames: [frames, 3], those percentiles of every frame that has depth.
         known_of_frames: [frames], share of the pixels of every frame.
         saturated_of_frames: [frames], share of the known depth of every frame.
+        greatest_of_frames: [frames], share of the known depth of every frame that is exactly the greatest.
         colors_of_frames: [frames, BINS, BINS, BINS], histogram of RGB of every frame, sums to 1.
     """
 
     depth_m: tuple[float, float, float]
     known: float
     saturated: float
+    greatest_m: float
     depth_of_frames: NDArray[np.float64]
     known_of_frames: NDArray[np.float64]
     saturated_of_frames: NDArray[np.float64]
+    greatest_of_frames: NDArray[np.float64]
     colors_of_frames: NDArray[np.float64]
 
     @property
@@ -122,16 +128,19 @@ class Sight:
         together = np.concatenate(known)
         low, middle, high = _percentiles(together) if len(together) else (np.nan,) * 3
         largest_m = (SATURATED - 0.5) * scale
+        greatest_m = greatest_apart(together)
         saturated = [float((k >= largest_m).sum() / max(len(k), 1)) for k in (together, *known)]
         return Sight(
             depth_m=(float(low), float(middle), float(high)),
             known=len(together) / max(sum(len(depth) for depth in depths), 1),
             saturated=saturated[0],
+            greatest_m=greatest_m,
             depth_of_frames=np.array([_percentiles(depth) for depth in known if len(depth)]).reshape(-1, 3),
             known_of_frames=np.array(
                 [len(k) / max(len(depth), 1) for k, depth in zip(known, depths, strict=True)]
             ),
             saturated_of_frames=np.array(saturated[1:]),
+            greatest_of_frames=np.array([float((k == greatest_m).sum() / max(len(k), 1)) for k in known]),
             colors_of_frames=np.array(colors).reshape(-1, BINS, BINS, BINS),
         )
 
@@ -169,10 +178,21 @@ def check_sight(robot: str, sight: Sight, config: ImageChecks) -> Iterator[Findi
             robot,
             f"{sight.saturated:.1%} of the known depth is the largest number, {SATURATED}",
             "0 where nothing was measured",
-            "let the converter take this number for none",
+            TAKE_FOR_NONE,
             confidence=share_above(
                 int((sight.saturated_of_frames > config.max_saturated).sum()), frames, FEW_FRAMES
             ),
+        )
+    elif shown := int((sight.greatest_of_frames > config.max_saturated).sum()):
+        yield Finding(
+            Severity.WARNING,
+            "depth",
+            robot,
+            f"{np.median(sight.greatest_of_frames):.1%} of the known depth is exactly {sight.greatest_m:.3f} m, far "
+            "beyond all other",
+            "0 where nothing was measured",
+            TAKE_FOR_NONE,
+            confidence=share_above(shown, frames),
         )
 
 

@@ -394,6 +394,43 @@ def test_frames_whose_color_is_cut_short_are_left_out(tmp_path: Path) -> None:
     )
 
 
+def test_color_without_depth_is_kept_to_be_followed(tmp_path: Path) -> None:
+    """Depth comes with the first image only: the last one is 150 ms away from it, beyond what can be moved."""
+    r = Ros(2)
+    late = START_NS + STEP_NS + 20_000_000
+    rows = [row for row in scene(r) if "/depth/image" not in row[0] or row[1] < late]
+    bag = r.write(tmp_path / "bag", rows, "mcap")
+    for option, kept, end in (("all", FRAMES, "followed by color"), ("official", 1, "left out")):
+        registry.convert("ros", bag, tmp_path / option, options=["truth=/odom", f"association={option}"])
+        with open_rgbd(tmp_path / option / "alpha.mcap") as log:
+            assert len(log) == kept
+            assert log.frame(0).depth.any()
+            assert kept == 1 or not log.frame(FRAMES - 1).depth.any()
+        warnings = json.loads((tmp_path / option / "recording.json").read_text())["warnings"]
+        assert any(text.endswith(end) for text in warnings)
+
+
+@pytest.mark.parametrize(("options", "left"), [([], 0), (["farthest_m=4"], 0), (["farthest_m=30"], 20_000)])
+def test_the_greatest_distance_is_no_measurement(tmp_path: Path, options: list[str], left: int) -> None:
+    r = Ros(2)
+    rows = []
+    for topic, log_ns, message in scene(r):
+        if "/depth/image" in topic:
+            z = render(DEPTH, path(FRAMES)[0])[1]
+            units = np.rint(1000 * z).astype(np.uint16)
+            units[:, :40] = 20_000
+            message = r.image(log_ns, "_depth", units, "16UC1")
+        rows.append((topic, log_ns, message))
+    bag = r.write(tmp_path / "bag", rows, "mcap")
+    registry.convert("ros", bag, tmp_path / "rec", options=options)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        depth_m = log.frame(0).depth
+        assert depth_m.max() == pytest.approx(left / 1000, rel=0.01) if left else 1.0 < depth_m.max() < 10.0
+        assert (depth_m > 0).mean() > 0.3
+    warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
+    assert any("is exactly 20.000 m" in text for text in warnings) == (not options)
+
+
 def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
     """To the last bit, in any unit, and beyond 32 m."""
     r = Ros(2)

@@ -1,0 +1,29 @@
+"""Depth that is exactly the greatest of a sensor: what some give where they measure nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+APART = 0.1
+"""Relative step below the greatest depth from which no surface leads to it."""
+STEPS_APART = 10
+"""Times the usual step between depths of a sensor that counts in coarse ones, likewise."""
+
+
+def greatest_apart(depth: NDArray[Any]) -> float:
+    """The greatest depth, if it comes more than once and no other comes near it; else 0.
+
+    Args:
+        depth: known depths of some images together, positive.
+    """
+    values, counts = np.unique(depth, return_counts=True)
+    if len(values) < 3 or counts[-1] < 2:
+        return 0.0
+    steps = np.diff(np.log(values.astype(np.float64)))
+    usual = (
+        float(np.median(steps[:-1][values[:-2] >= values[-2] / 2])) if values[-3] >= values[-2] / 2 else APART
+    )
+    return float(values[-1]) if steps[-1] > max(APART, STEPS_APART * usual) else 0.0

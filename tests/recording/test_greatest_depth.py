@@ -1,0 +1,22 @@
+"""Depth that a camera gives where it measures nothing stands apart; far surfaces and coarse steps do not."""
+
+import numpy as np
+
+from duagc.pipeline.recording.greatest_depth import greatest_apart
+
+
+def test_the_greatest_distance_of_a_camera_stands_apart() -> None:
+    measured = np.linspace(0.8, 3.1, 500, dtype=np.float32)
+    assert greatest_apart(np.concatenate([measured, np.full(90, 8.0, np.float32)])) == 8.0
+    assert greatest_apart(np.concatenate([measured, np.full(90, 3.15, np.float32)])) == 0.0
+    assert greatest_apart(np.append(measured, np.float32(8.0))) == 0.0  # a single one is noise
+
+
+def test_surfaces_do_not_stand_apart() -> None:
+    """A far wall behind a room has more than one depth; a sensor of disparity has few, and far apart at the end."""
+    room, wall = np.linspace(0.8, 3.1, 500), np.linspace(5.9, 6.0, 50)
+    assert greatest_apart(np.concatenate([room, wall])) == 0.0
+    steps = np.float32(20.0) / np.arange(2, 30)
+    assert greatest_apart(np.repeat(steps, 40)) == 0.0
+    assert greatest_apart(np.full(100, 2.0)) == 0.0
+    assert greatest_apart(np.zeros(0)) == 0.0
