@@ -1,7 +1,8 @@
-"""TUM RGB-D: handheld and robot sequences with motion capture, Kinect v1.
+"""TUM RGB-D: handheld and robot sequences with motion capture, Kinect v1; and others in this layout.
 
 SRC is a sequence, for example `rgbd_dataset_freiburg1_desk`: `rgb.txt`, `depth.txt` (time, file), `groundtruth.txt`
-(pose of the color camera). Depth is registered to the distorted color image, so both are undistorted together.
+(pose of the color camera). Depth is registered to the distorted color image, so both are undistorted together. Of other
+cameras the intrinsics are in `calibration.txt` (`fx fy cx cy`, as ETH3D has it) or an option.
 """
 
 from __future__ import annotations
@@ -10,10 +11,15 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from pydantic import Field
+
 from duagc.converters.layouts import image_folder, tum_layout
-from duagc.converters.layouts.image_files import options_of
+from duagc.converters.layouts.image_files import image_size, options_of
 from duagc.converters.layouts.image_folder import Clip
+from duagc.converters.robot_writer import check_camera
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 1 / 5000
@@ -35,6 +41,11 @@ class Options(tum_layout.AssociationOptions):
 
     camera: Literal["auto", "freiburg1", "freiburg2", "freiburg3"] = "auto"
     """Which Kinect; auto takes it from the name of the folder."""
+    intrinsics: str = ""
+    """Of another camera, `fx fy cx cy` (px) and its distortion `k1 k2 p1 p2 k3` if it has one; before
+    `calibration.txt`."""
+    depth_scale: float = Field(DEPTH_SCALE, gt=0)
+    """Meters per unit of depth."""
     undistort: bool = True
     """Take the lens distortion out of color and depth together; without, images stay as they are and a pinhole camera
     does not describe them."""
@@ -47,27 +58,49 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         DuagError: names the file, what was found and what was expected.
     """
     settings = options_of(Options, options, "tum")
-    camera, distortion = CAMERAS[_which(src, settings)]
     frames, _, warnings = tum_layout.frames_of(src, settings)
+    camera, distortion, sensor = _camera(src, settings, frames[0].color)
     clip = Clip(
         "",
         frames,
         camera,
-        DEPTH_SCALE,
+        settings.depth_scale,
         distortion=distortion if settings.undistort else (),
-        sensors={"depth": "Kinect v1, registered to color by the dataset"},
+        sensors={"depth": f"{sensor}, registered to color by the dataset"},
     )
     image_folder.write_parts(
         out, "tum", src, clip, robots=robots, options=settings, warnings=warnings, force=force
     )
 
 
-def _which(src: Path, settings: Options) -> str:
-    if settings.camera != "auto":
-        return settings.camera
+def _camera(src: Path, settings: Options, image: Path) -> tuple[PinholeCamera, tuple[float, ...], str]:
+    """Camera, distortion and name of the sensor: by the options, the name of the folder, or its calibration.txt."""
     match = re.search(r"freiburg[123]|fr[123]", src.resolve().name)
-    if not match:
+    stated = src / "calibration.txt"
+    if settings.intrinsics:
+        return *_stated(settings.intrinsics, "intrinsics", image), "depth camera"
+    if settings.camera != "auto":
+        return *CAMERAS[settings.camera], "Kinect v1"
+    if match:
+        return *CAMERAS[f"freiburg{match[0][-1]}"], "Kinect v1"
+    if stated.is_file():
+        return *_stated(read_text(stated, "fx fy cx cy"), str(stated), image), "depth camera"
+    raise DuagError(
+        f"{src}: its name holds none of {', '.join(CAMERAS)}, and it has no calibration.txt; expected "
+        "--set intrinsics='fx fy cx cy', or camera=NAME with one of these"
+    )
+
+
+def _stated(text: str, where: str, image: Path) -> tuple[PinholeCamera, tuple[float, ...]]:
+    """Camera and distortion by the numbers of a text; the size is that of an image."""
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (4, 8, 9) or not np.all(np.isfinite(numbers)):
         raise DuagError(
-            f"{src}: its name holds none of {', '.join(CAMERAS)}, expected --set camera=NAME with one of them"
+            f"tum: {where}: {text.strip()[:60]!r}, expected fx fy cx cy, or these and k1 k2 p1 p2 k3"
         )
-    return f"freiburg{match[0][-1]}"
+    camera = PinholeCamera(*image_size(image), *numbers[:4])
+    check_camera(camera, f"tum: {where}")
+    return camera, tuple(numbers[4:])

@@ -32,6 +32,16 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
         raise DuagError(f"{dataset}: {name} = {first['input']!r}: {first['msg']}") from error
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of a color image."""
+    import cv2
+
+    image = decode_image(read_bytes(path, "a color image"), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise DuagError(f"{path}: no decoder reads it, expected a color image")
+    return int(image.shape[1]), int(image.shape[0])
+
+
 def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str, NDArray[np.uint8]]:
     """A color image of `size` (width, height): its bytes as they are, their format, and BGR [H, W, 3]."""
     import cv2

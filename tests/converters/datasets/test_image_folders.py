@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from duagc.converters import registry
-from duagc.converters.datasets import bonn, icl_nuim
+from duagc.converters.datasets import bonn, icl_nuim, tum
 from duagc.converters.layouts import tum_layout
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd, read_log
 from duagc.schemas import topics
 from tests.fixtures.box_room import path, render, save
@@ -243,6 +244,34 @@ def test_a_wrong_convention_is_found_out(
         edit(copy / "traj0.gt.freiburg", lambda _: "\n".join(poses))
     with pytest.raises(DuagError, match="do not belong together"):
         registry.convert(name, copy, tmp_path / "out")
+
+
+def test_other_cameras_in_the_layout_of_tum(made: dict[str, tuple[Path, Path]], tmp_path: Path) -> None:
+    """By an option with its distortion as with the camera's name; by a calibration.txt; or it says what is missing."""
+    src, recording = made["tum"]
+    camera, distortion = tum.CAMERAS["freiburg1"]
+    other = tmp_path / "kitchen"
+    shutil.copytree(src, other)
+    with pytest.raises(DuagError, match="expected --set intrinsics="):
+        registry.convert("tum", other, tmp_path / "none")
+    numbers = " ".join(repr(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy, *distortion))
+    registry.convert(
+        "tum", other, tmp_path / "stated", options=[f"intrinsics={numbers}", "depth_scale=0.0002"]
+    )
+    (other / "calibration.txt").write_text("530 531 320.5 239.5\n")
+    registry.convert("tum", other, tmp_path / "filed")
+    with (
+        open_rgbd(recording / "alpha.mcap") as log,
+        open_rgbd(tmp_path / "stated" / "alpha.mcap") as stated,
+        open_rgbd(tmp_path / "filed" / "alpha.mcap") as filed,
+    ):
+        assert stated.camera == log.camera
+        np.testing.assert_array_equal(stated.frame(1).depth, log.frame(1).depth)
+        np.testing.assert_array_equal(stated.frame(1).color, log.frame(1).color)
+        assert filed.camera == PinholeCamera(640, 480, 530.0, 531.0, 320.5, 239.5)
+    for text in ("530 531 320", "530 531 320 x", "0 531 320 240"):
+        with pytest.raises(DuagError, match="intrinsics"):
+            registry.convert("tum", other, tmp_path / "bad", options=[f"intrinsics={text}"])
 
 
 def test_the_rotation_of_bonn_is_one() -> None:
