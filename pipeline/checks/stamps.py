@@ -72,9 +72,9 @@ def check_pairs(robot: str, pairing: Pairing, config: TimeChecks) -> Iterator[Fi
             Severity.WARNING if few else Severity.NOTE,
             "pairs",
             robot,
-            f"{frames} color images have {own} depth images, {alone} none within {TOLERANCE_NS / 1e6:g} ms",
+            f"{own} depth images for {frames} color images; {alone} have none within {TOLERANCE_NS / 1e6:g} ms",
             "depth for every color image",
-            f"shared depth is moved by the motion of the camera, without any color is followed alone{advice}",
+            f"shared depth is moved by the motion of the camera, and color without any is followed alone{advice}",
         )
     offsets = pairing.offsets_ns
     typical = float(np.median(offsets)) if len(offsets) else 0.0
