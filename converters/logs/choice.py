@@ -25,11 +25,13 @@ class Choice:
 
     Attributes:
         candidates: topics that could have been meant.
+        expected: what decides, if not the option of the topic.
     """
 
     topic: str
     why: str
     candidates: tuple[str, ...] = ()
+    expected: str = ""
 
     def required(self, log: Log, option: str) -> str:
         """The topic.
@@ -38,7 +40,7 @@ class Choice:
             DuagError: there is none; names the option that decides.
         """
         if not self.topic:
-            raise DuagError(f"{log.name}: {self.why}; expected --set {option}=TOPIC")
+            raise DuagError(f"{log.name}: {self.why}; expected --set {self.expected or f'{option}=TOPIC'}")
         return self.topic
 
 
@@ -109,8 +111,10 @@ class Chooser:
         shared = {info: shared_parts(image_topic, info) for info in self.infos}
         best = [info for info in self.infos if shared[info] == max(shared.values())]
         if len(best) != 1 or shared[best[0]] == 0:
-            names = ", ".join(self.infos) or "no topic"
-            return Choice("", f"{image_topic} has CameraInfo on {names}", tuple(self.infos))
+            if not self.infos:
+                stated = f"{option.removesuffix('_info')}_camera='fx fy cx cy'"
+                return Choice("", f"{image_topic} has CameraInfo on no topic", expected=stated)
+            return Choice("", f"{image_topic} has CameraInfo on {', '.join(self.infos)}", tuple(self.infos))
         return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
 
     def _one(

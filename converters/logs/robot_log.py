@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from duagc.converters.layouts.ros_images import RosCamera, is_integer_depth, size_of
 from duagc.converters.layouts.tum_layout import Listed, associate
 from duagc.converters.layouts.validity import of_maps
-from duagc.converters.logs.camera_watch import CameraWatch
+from duagc.converters.logs.cameras import CameraWatch, stated, stated_camera
 from duagc.converters.logs.choice import REGISTERED, Chooser, video_words
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
@@ -136,7 +136,9 @@ class RobotLog:
         return chooser.info(option, topic).required(self.log, option)
 
     def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
-        """Camera of an image topic."""
+        """Camera of an image topic: as the options state it, else by its CameraInfo."""
+        if text := stated(self.settings, option, bool(chooser.infos)):
+            return stated_camera(text, chooser.images[topic], f"{self.name}: {topic}")
         chosen = self._info(topic, option, chooser)
         camera = RosCamera.of(self.log.first(chosen), _is_rectified(topic), f"{self.name}: {chosen}")
         self._cameras[chosen] = (camera, _is_rectified(topic))
@@ -366,12 +368,8 @@ class RobotLog:
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, color and depth message (if any) of every frame, in order of time; holds no more than it must."""
         order = sorted(self.pairs)
-        groups = []
-        for time in order:
-            depth_ns = self.pairs[time]
-            groups.append(
-                {self.color: time} if depth_ns is None else {self.color: time, self.depth: depth_ns}
-            )
+        wanted = [{self.color: time, self.depth: self.pairs[time]} for time in order]
+        groups = [{topic: time for topic, time in group.items() if time is not None} for group in wanted]
         # to the end of the log, so that all its checksums are compared
         for index, found in enumerate(gathered(self.log, groups, self.time_ns)):
             depth = found.get(self.depth)

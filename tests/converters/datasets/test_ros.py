@@ -394,6 +394,31 @@ def test_frames_whose_color_is_cut_short_are_left_out(tmp_path: Path) -> None:
     )
 
 
+def test_cameras_can_be_stated_where_the_log_has_none(tmp_path: Path) -> None:
+    r = Ros(2)
+    whole = r.write(tmp_path / "whole", scene(r), "mcap")
+    bag = r.write(tmp_path / "bag", [row for row in scene(r) if "camera_info" not in row[0]], "mcap")
+    with pytest.raises(DuagError, match="CameraInfo on no topic; expected --set color_camera='fx fy cx cy'"):
+        registry.convert("ros", bag, tmp_path / "none")
+    color, depth = (
+        " ".join(repr(x) for x in (c.fx, c.fy, c.cx, c.cy, *lens))
+        for c, lens in ((COLOR, DISTORTION), (DEPTH, ()))
+    )
+    options = [f"color_camera={color}", f"depth_camera={depth}"]
+    registry.convert("ros", whole, tmp_path / "as", options=["truth=/odom"])
+    registry.convert("ros", bag, tmp_path / "stated", options=["truth=/odom", *options])
+    with (
+        open_rgbd(tmp_path / "as" / "alpha.mcap") as one,
+        open_rgbd(tmp_path / "stated" / "alpha.mcap") as other,
+    ):
+        assert one.camera == other.camera
+        np.testing.assert_array_equal(one.frame(1).color, other.frame(1).color)
+        np.testing.assert_array_equal(one.frame(1).depth, other.frame(1).depth)
+    for text in ("140 141 79", "140 141 79 x", "-1 141 79 60"):
+        with pytest.raises(DuagError, match="camera"):
+            registry.convert("ros", bag, tmp_path / "bad", options=[f"color_camera={text}", options[1]])
+
+
 def test_color_without_depth_is_kept_to_be_followed(tmp_path: Path) -> None:
     """Depth comes with the first image only: the last one is 150 ms away from it, beyond what can be moved."""
     r = Ros(2)

@@ -1,0 +1,77 @@
+"""Cameras of a log: those that the options state, and whether the others stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from duagc.converters.layouts.ros_images import RosCamera, size_of
+from duagc.converters.logs.entries import Entry
+from duagc.converters.logs.options import LogOptions
+from duagc.converters.robot_writer import check_camera
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
+
+
+def stated(settings: LogOptions, option: str, has_infos: bool) -> str:
+    """What the options say of the camera of an image topic; empty: its CameraInfo does.
+
+    Args:
+        settings: the options.
+        option: which CameraInfo it would be, "color_info" or "depth_info".
+        has_infos: whether the log has any CameraInfo.
+    """
+    if option == "color_info":
+        return settings.color_camera
+    registered = settings.registered == "yes" and not has_infos
+    return settings.depth_camera or (settings.color_camera if registered else "")
+
+
+def stated_camera(text: str, image: Any, where: str) -> RosCamera:
+    """The camera of a text "fx fy cx cy", or with "k1 k2 p1 p2 k3" after it.
+
+    Args:
+        text: the numbers, pixels.
+        image: a message, whose size and frame are those of the camera.
+        where: begins the line of an error.
+    Raises:
+        DuagError: the text is no camera.
+    """
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (4, 8, 9) or not np.all(np.isfinite(numbers)):
+        raise DuagError(f"{where}: camera {text!r}, expected fx fy cx cy, or these and k1 k2 p1 p2 k3")
+    camera = PinholeCamera(*size_of(image, where), *numbers[:4])
+    check_camera(camera, where)
+    distortion = tuple(numbers[4:]) if any(numbers[4:]) else ()
+    return RosCamera(camera, distortion, False, image.header.frame_id)
+
+
+class CameraWatch:
+    """Watches that what a CameraInfo says does not change: a camera of the recording is one camera."""
+
+    def __init__(self, first: Mapping[str, tuple[RosCamera, bool]], name: str) -> None:
+        self._first, self._name = first, name
+        self._seen: dict[str, bytes] = {}
+
+    def see(self, entry: Entry) -> None:
+        """Compare a message with the first one. Raises DuagError where the difference can be seen in images."""
+        rest = entry.data[16:]  # in ROS what follows the times of the header, most often the same bytes
+        if self._seen.get(entry.topic) == rest:
+            return
+        self._seen[entry.topic] = rest
+        first, rectified = self._first[entry.topic]
+        where = f"{self._name}: {entry.topic}"
+        now = RosCamera.of(entry.read(), rectified, where)
+        a, b = (np.array([c.camera.fx, c.camera.fy, c.camera.cx, c.camera.cy]) for c in (first, now))
+        if np.abs(a - b).max() > SAME_CAMERA_PX or first.distortion != now.distortion:
+            raise DuagError(
+                f"{where} changes at {entry.log_ns} ns from fx fy cx cy = {a.round(2).tolist()} px to "
+                f"{b.round(2).tolist()}, expected one camera (a zoom or autofocus has to be fixed while recording)"
+            )
