@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.checks import estimate, geometry, images, measured, scale, stamps
+from duagc.pipeline.checks import estimate, geometry, gyroscope, images, measured, scale, stamps
 from duagc.pipeline.checks.findings import Finding, Report, Severity, judged, lines
 from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.recording import Recording, RgbdLog, log_metadata, open_rgbd
+from duagc.pipeline.recording import MotionPrior, Recording, RgbdLog, log_metadata, open_rgbd
 from duagc.pipeline.recording.names import DIGEST_RECORD
 from duagc.pipeline.recording.read import LogFile
 
@@ -106,7 +106,9 @@ def _check_robot(
         add(geometry.check_moves(robot, moved, config.motion))
         sensors = " ".join(f"{key} {value}" for key, value in log_metadata(log.path).items())
         add(geometry.check_range(robot, sight, moved, sensors, config=config.motion))
-        add(_check_scales(recording, log, moved, config.motion))
+        prior = log.motion_prior()
+        add(_check_scales(recording, log, moved, prior, config=config.motion))
+        add(gyroscope.check_gyroscope(robot, moved, prior))
         add(geometry.check_edges(robot, geometry.edges_of(log, config.edges), config.edges))
     residuals = [move.residual for move in moved if np.isfinite(move.residual)]
     report.robots[robot] = {
@@ -149,9 +151,13 @@ def _check_clock(recording: Recording, robot: str) -> Iterator[Finding]:
 
 
 def _check_scales(
-    recording: Recording | None, log: RgbdLog, moved: list[geometry.Move], config: MotionChecks
+    recording: Recording | None,
+    log: RgbdLog,
+    moved: list[geometry.Move],
+    prior: MotionPrior | None,
+    *,
+    config: MotionChecks,
 ) -> Iterator[Finding]:
-    prior = log.motion_prior()
 
     def by_odometry(start_ns: int, stop_ns: int) -> float | None:
         motion = prior.between(start_ns, stop_ns) if prior else None
