@@ -161,7 +161,7 @@ class RecordingWriter:
             if row.get("rough"):
                 self.warnings.append(
                     f"{robot}: depth moved by its true poses differs by {row['reprojection_median_m']:.3f} m at "
-                    f"{row['median_depth_m']:.2f} m (medians): they are rough, and so are errors against them"
+                    f"{row['median_depth_m']:.2f} m (medians), far less than without a motion: poses or depth are rough"
                 )
         unknown = sorted(set(USER_MASKS.get() or {}) - {ALL_ROBOTS} - set(self._robots))
         if unknown:
