@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.layouts.validity import EVERY, BlackBorder, mask_of_user
+from duagc.converters.layouts.validity import EVERY, EVERY_NS, BlackBorder, mask_of_user
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -87,6 +87,7 @@ class RobotWriter:
         self._valid = mask_of_user(name, camera.width, camera.height)
         self._black = BlackBorder() if find_black else None
         self._black_share = 0.0
+        self._next_look_ns = 0
         # topic of a sensor's pose in the camera that is still to be written
         self._sensors: dict[str, NDArray[np.float64]] = {}
         self._stamps: list[int] = []
@@ -165,8 +166,10 @@ class RobotWriter:
             calibration = messages.pack_calibration(stamp_ns, name, self.camera)
             self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
             self._write_valid(stamp_ns)
-        if self._black is not None and len(self._stamps) % EVERY == 0:
+        due = len(self._stamps) % EVERY == 0 or stamp_ns >= self._next_look_ns
+        if self._black is not None and due:
             self._black.add(color)
+            self._next_look_ns = stamp_ns + EVERY_NS
         self._stamps.append(int(stamp_ns))
         self._log.write(
             topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns

@@ -22,9 +22,15 @@ from duagc.pipeline.geometry.masks import Mask
 
 ALL_ROBOTS = ""
 BLACK = 8  # of 255: a pixel that is never brighter sees nothing
-BRIGHT = 40  # of 255: an image whose median is no brighter cannot tell black pixels from a dark scene
+BRIGHT, BRIGHT_PERCENT = (
+    40,
+    75,
+)  # of 255: a percentile; an image with none above cannot tell black from a dark scene
 LEAST_IMAGES = 8  # that must tell
-EVERY = 8  # images of a recording of which one is looked at
+EVERY, EVERY_NS = (
+    8,
+    250_000_000,
+)  # an image of so many is looked at; where they are fewer, one in so long a time
 LEAST_BLACK = 0.002  # of the pixels, in pieces that touch the border
 GROW_PX = 4  # a vignette does not end from one pixel to the next
 ROUNDING_PX = 1e-4  # of maps that are float32; changes a gray value by less than 0.03
@@ -65,14 +71,16 @@ class BlackBorder:
         self._images = 0
 
     def add(self, data: bytes) -> None:
-        """Take an encoded color image of the recording; every `EVERY`-th does."""
+        """Take an encoded color image of the recording; those of `EVERY` and `EVERY_NS` do."""
         import cv2
 
         image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             return  # reading the recording will complain
         value = np.asarray(image.max(axis=2), dtype=np.uint8)
-        if np.median(value) > BRIGHT and (self._brightest is None or value.shape == self._brightest.shape):
+        if np.percentile(value, BRIGHT_PERCENT) > BRIGHT and (
+            self._brightest is None or value.shape == self._brightest.shape
+        ):
             self._brightest = value if self._brightest is None else np.maximum(self._brightest, value)
             self._images += 1
 

@@ -72,6 +72,29 @@ def test_a_black_vignette_is_found_with_a_margin() -> None:
     assert 0 < np.count_nonzero(~shown & ~black) < 0.25 * black.size
 
 
+def test_bars_that_leave_little_of_an_image_are_found() -> None:
+    bars = np.ones((48, 64), bool)
+    bars[14:30] = False
+    shown = images(8, bars).result(None)
+    assert shown is not None
+    assert not shown[bars].any()
+    assert shown[20:24].all()
+
+
+def test_a_camera_of_few_images_a_second_is_looked_at_as_often(tmp_path: Path) -> None:
+    """At 4 Hz every image tells, at 40 Hz every tenth: 12 images are enough, or too few."""
+    color = np.full((48, 64, 3), 120, np.uint8)
+    color[:10] = 0
+    data = cv2.imencode(".png", color)[1].tobytes()
+    for rate, found in ((4, True), (40, False)):
+        camera = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
+        recording = RecordingWriter(tmp_path / str(rate))
+        with recording, recording.robot("alpha", camera, 0.001) as robot:
+            for k in range(12):
+                robot.add_frame(k * 10**9 // rate, data, "png", np.full((48, 64), 1000, np.uint16))
+        assert any("black in all images" in text for text in recording.warnings) == found
+
+
 def test_black_inside_dark_images_and_few_images_are_no_vignette() -> None:
     inside = np.zeros((48, 64), bool)
     inside[20:30, 20:30] = True
