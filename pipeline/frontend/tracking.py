@@ -356,6 +356,8 @@ class Tracker:
         elapsed_s = max(state.elapsed_s(frame.stamp_ns), 0.5 * state.intervals.median_s)
         step = se3.inverse(state.T_keyframe_camera) @ result.T_reference_target
         state.velocity = se3.log(step) / elapsed_s if followed else np.zeros(6)
+        if followed and found.without is Reason.NONE and not len(result.weak):
+            state.compare_gyro(frame.stamp_ns, step[:3, :3])
         if not same_keyframe:
             state.last_good = None
         state.keyframe_index, state.T_keyframe_camera = found.keyframe_index, result.T_reference_target

@@ -18,10 +18,11 @@ from duagc.pipeline.frontend.failure import (
     Reason,
     Viewpoint,
 )
+from duagc.pipeline.frontend.gyro_calibration import MOST, GyroCorrection, Turn
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
-from duagc.pipeline.recording import MotionPrior
+from duagc.pipeline.recording import Motion, MotionPrior
 from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract_from_pyramid
 
@@ -114,6 +115,8 @@ class TrackingState:
         frames_without_color: the same for color.
         last_good: the last frame with depth and color and nothing in front of it.
         recent: time and T_map_camera of the last frames that were tracked without a loss between them.
+        turns: by a gyroscope and by the images, of the last frames that the images determine.
+        gyro: what these say of the gyroscope.
         intervals: between frames.
         frozen: detects frozen images.
         occlusion: detects objects in front of the camera.
@@ -134,6 +137,8 @@ class TrackingState:
     frames_without_color: int = 0
     last_good: LastGoodFrame | None = None
     recent: list[tuple[int, Array]] = field(default_factory=list)
+    turns: list[Turn] = field(default_factory=list)
+    gyro: GyroCorrection = field(default_factory=GyroCorrection)
     intervals: FrameIntervals = field(init=False)
     frozen: FrozenImageDetector = field(init=False)
     occlusion: OcclusionDetector = field(init=False)
@@ -157,6 +162,7 @@ class TrackingState:
             pairs=list(self.pairs),
             gray_rms=list(self.gray_rms),
             recent=list(self.recent),
+            turns=list(self.turns),
         )
         other.intervals = copy.copy(self.intervals)
         other.frozen, other.occlusion = copy.copy(self.frozen), copy.copy(self.occlusion)
@@ -188,7 +194,7 @@ class TrackingState:
         last, elapsed_s = self.T_keyframe_camera, self.elapsed_s(stamp_ns)
         fresh = elapsed_s <= self.config.tracking.max_extrapolation_s
         followed = last @ se3.exp(self.velocity * elapsed_s) if fresh else last
-        motion = self.motion.between(self.stamp_ns, stamp_ns) if self.motion is not None else None
+        motion = self._moved(self.stamp_ns, stamp_ns)
         if motion is None:
             return Prediction(followed, None, self._deviation_px(elapsed_s, turns=True))
         config, T = self.config.tracking.prior, motion.T_start_stop
@@ -197,11 +203,40 @@ class TrackingState:
             sigma_m = config.odometry_sigma_m + config.odometry_sigma_of_path * float(path_m)
             sigma_rad = config.odometry_sigma_rad + config.odometry_sigma_of_angle * float(angle_rad)
             return Prediction(last @ T, np.diag([sigma_m**-2.0] * 3 + [sigma_rad**-2.0] * 3))
-        sigma_rad = config.gyro_sigma_rad + config.gyro_sigma_rad_per_s * elapsed_s
+        sigma_rad = max(self._stated_gyro_sigma_rad(elapsed_s), self.gyro.sigma * elapsed_s)
         predicted = last @ T
         predicted[:3, 3] = followed[:3, 3]
         information = np.diag([0.0] * 3 + [sigma_rad**-2.0] * 3)
         return Prediction(predicted, information, self._deviation_px(elapsed_s, turns=False))
+
+    def _moved(self, start_ns: int, stop_ns: int) -> Motion | None:
+        """The motion by other sensors, a gyroscope corrected by the images; None where that says nothing."""
+        motion = None if self.motion is None else self.motion.between(start_ns, stop_ns)
+        if motion is None or motion.knows_translation:
+            return motion
+        if not self.gyro.helps:
+            return None
+        R = self.gyro.corrected(motion.T_start_stop[:3, :3], 1e-9 * (stop_ns - start_ns))
+        return Motion(se3.from_rotation_translation(R, np.zeros(3)), knows_translation=False)
+
+    def _stated_gyro_sigma_rad(self, elapsed_s: float) -> float:
+        config = self.config.tracking.prior
+        return config.gyro_sigma_rad + config.gyro_sigma_rad_per_s * elapsed_s
+
+    def compare_gyro(self, stamp_ns: int, R_last_camera: Array) -> None:
+        """Take in how the camera turned since the last frame, by images that determine it.
+
+        Args:
+            stamp_ns: now.
+            R_last_camera: [3, 3].
+        """
+        motion = None if self.motion is None else self.motion.between(self.stamp_ns, stamp_ns)
+        elapsed_s = self.elapsed_s(stamp_ns)
+        if motion is None or motion.knows_translation or elapsed_s <= 0:
+            return
+        turn = Turn(so3.log(motion.T_start_stop[:3, :3]) / elapsed_s, so3.log(R_last_camera) / elapsed_s)
+        self.turns = [*self.turns[1 - MOST :], turn]
+        self.gyro = GyroCorrection.of(self.turns, self._stated_gyro_sigma_rad(elapsed_s) / elapsed_s)
 
     def _deviation_px(self, elapsed_s: float, *, turns: bool) -> float:
         """By how much acceleration moves a view off its prediction, pixels of the coarsest image of a registration."""
@@ -225,8 +260,7 @@ class TrackingState:
         moved = self._mean_motion(stamp_ns, depth_offset_ns)
         if moved is None or self.motion is None:
             return moved
-        first, last = sorted((stamp_ns, stamp_ns + depth_offset_ns))
-        motion = self.motion.between(first, last)
+        motion = self._moved(*sorted((stamp_ns, stamp_ns + depth_offset_ns)))
         if motion is None:
             return moved
         T = motion.T_start_stop if depth_offset_ns > 0 else se3.inverse(motion.T_start_stop)
