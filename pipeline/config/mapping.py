@@ -45,7 +45,11 @@ class MappingConfig(Config):
     """How the map is grown and optimized."""
 
     max_gaussians: int = 60_000
-    """Hard cap. When a keyframe would exceed it, the Gaussians whose removal changes the keyframes least go first."""
+    """Hard cap of a tile. When a keyframe would exceed it, Gaussians whose removal changes keyframes least go first."""
+    tile_keyframes: int = Field(default=64, ge=2)
+    """Most keyframes of a tile: a longer log has a map of several, each optimized with the images of its keyframes."""
+    border_keyframes: int = Field(default=16, ge=0)
+    """Most keyframes of other tiles, the nearest, whose images take part in the optimization of a tile."""
     first_share: float = 0.35
     """Share of the cap that the first keyframe may fill."""
     keyframe_share: float = 0.12
@@ -65,14 +69,14 @@ class MappingConfig(Config):
     final_iterations_view: int = 22
     """The same for every view, keyframe or supporting frame; the larger number of steps counts."""
     final_iterations_max: int = 6000
-    """Most steps of the final optimization in all."""
+    """Most steps of the final optimization of a tile."""
     keyframe_megapixels_s: float | None = Field(default=None, ge=0.0)
     """Most megapixels that the steps at keyframes look at, per second of log since the keyframe before; None: any."""
     final_megapixels_s: float | None = Field(default=None, ge=0.0)
     """Most megapixels that the final optimization looks at, per second of log; None: any. Budgets count pixels, not
     time: no clock changes a result. What they leave out is said."""
     support_views: int = 40
-    """Most tracked frames between keyframes that take part in the final optimization; 0: keyframes only."""
+    """Most tracked frames between keyframes that take part in the final optimization, per tile; 0: keyframes only."""
     pose_rate: float = Field(default=0.25, ge=0.0)
     """Largest step of the pose of a view in the final optimization, in standard deviations by tracking, where depth is
     not exact; it falls as the learning rates do. 0: poses stay where tracking and pose graph put them."""

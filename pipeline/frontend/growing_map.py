@@ -1,4 +1,8 @@
-"""The Gaussians of a map that grows: with the state of their optimizer and what each contributes to images."""
+"""The Gaussians of a map that grows: with the state of their optimizer and what each contributes to images.
+
+A tile of a large map is taken out and optimized alone. Gaussians in it that belong to other tiles are its guests: no
+tile removes them for want of contribution, and the final optimization leaves them as they are.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.mapping import MappingConfig
-from duagc.pipeline.kernels import CompiledAdam
+from duagc.pipeline.kernels import CompiledAdam, Gradients
 from duagc.pipeline.splat.gaussians import Gaussians
 
 FADING = 0.9
@@ -23,6 +27,8 @@ class GrowingMap:
         adam: state of their optimizer.
         contribution: of each, as last measured; infinite if never.
         next_id: of the next Gaussian that is made.
+        guests: the first so many Gaussians belong to other tiles of the map.
+        uncounted: guests that count for no cap.
     """
 
     def __init__(self, config: MappingConfig, *, threads: int = 1) -> None:
@@ -37,13 +43,15 @@ class GrowingMap:
         self.adam = CompiledAdam(threads=threads)
         self.contribution = np.zeros(0)
         self.next_id = 0
+        self.guests = self.uncounted = 0
 
     def __len__(self) -> int:
         return len(self.gaussians)
 
     def state(self) -> tuple[Any, ...]:
         """All that it knows; `go_on` takes it."""
-        return self.gaussians, self.contribution, self.next_id, self.adam.state()
+        counts = self.next_id, self.guests, self.uncounted
+        return self.gaussians, self.contribution, counts, self.adam.state()
 
     def go_on(self, state: tuple[Any, ...]) -> None:
         """Go on from where another one was.
@@ -51,8 +59,54 @@ class GrowingMap:
         Args:
             state: of that one.
         """
-        self.gaussians, self.contribution, self.next_id, adam = state
+        self.gaussians, self.contribution, counts, adam = state
+        self.next_id, self.guests, self.uncounted = counts
         self.adam.go_on(adam)
+
+    @property
+    def cap(self) -> int:
+        """Most Gaussians while the map grows: half of the cap is there for new ones, however many guests there are."""
+        most, counted = self.config.max_gaussians, self.guests - self.uncounted
+        return max(most, counted + most // 2) + self.uncounted
+
+    @property
+    def room(self) -> int:
+        """How many Gaussians may be added where the map is drawn worst."""
+        return max(0, self.config.max_gaussians + self.uncounted - len(self))
+
+    def take(self, guests: NDArray[np.int64], own: NDArray[np.int64], uncounted: int) -> GrowingMap:
+        """Take Gaussians out, into a map of their own, where new ones are made.
+
+        Args:
+            guests: rows of those that belong to other tiles.
+            own: rows of the others.
+            uncounted: how many of the guests count for no cap.
+        """
+        rows = np.concatenate([guests, own])
+        part = GrowingMap(self.config, threads=self.adam.threads)
+        part.go_on(self._selected(rows, (self.next_id, len(guests), uncounted)))
+        rest = np.ones(len(self), bool)
+        rest[rows] = False
+        self.keep(rest)
+        return part
+
+    def put_back(self, part: GrowingMap) -> None:
+        """Put Gaussians back that were taken out, after those that stayed.
+
+        Args:
+            part: that was taken out of this map.
+        """
+        self.next_id = part.next_id
+        self.gaussians = Gaussians.concatenate([self.gaussians, part.gaussians])
+        self.contribution = np.concatenate([self.contribution, part.contribution])
+        self.adam.append(part.adam)
+
+    def _selected(self, rows: NDArray[np.int64], counts: tuple[int, int, int]) -> tuple[Any, ...]:
+        """The state of a map of some of the Gaussians."""
+        adam = CompiledAdam(threads=self.adam.threads)
+        adam.append(self.adam)
+        adam.select(rows)
+        return self.gaussians.select(rows), self.contribution[rows], counts, adam.state()
 
     def append(self, new: Gaussians) -> None:
         """Add Gaussians, whose contribution is not measured yet.
@@ -79,7 +133,7 @@ class GrowingMap:
         self.contribution = np.where(seen, np.maximum(found, faded), self.contribution)
 
     def prune_least(self, count: int) -> int:
-        """Remove the Gaussians with the least contribution; ties go by position.
+        """Remove the Gaussians with the least contribution; ties go by position. Guests stay.
 
         Args:
             count: how many.
@@ -87,17 +141,31 @@ class GrowingMap:
         Returns:
             How many were removed.
         """
-        order = np.argsort(self.contribution, kind="stable")
+        order = self.guests + np.argsort(self.contribution[self.guests :], kind="stable")
         keep = np.ones(len(self), bool)
         keep[order[:count]] = False
         return self.keep(keep)
 
     def prune_degenerate(self) -> int:
-        """Remove Gaussians that are transparent or huge; how many there were."""
+        """Remove Gaussians that are transparent or huge, and no guests; how many there were."""
         config = self.config
         logit = np.log(config.min_opacity / (1 - config.min_opacity))
         huge = self.gaussians.log_scales.max(axis=1, initial=-np.inf) > np.log(config.max_scale_m)
-        return self.keep((self.gaussians.opacity_logits >= logit) & ~huge)
+        return self.keep((self.gaussians.opacity_logits >= logit) & ~huge | self.is_guest)
+
+    def keep_guests(self, gradients: Gradients) -> None:
+        """Let an optimization step leave the guests as they are.
+
+        Args:
+            gradients: of a loss; those of guests become zero.
+        """
+        gradients.colors[: self.guests] = 0.0
+        gradients.opacity_logits[: self.guests] = 0.0
+
+    @property
+    def is_guest(self) -> NDArray[np.bool_]:
+        """[n], which Gaussians belong to other tiles of the map."""
+        return np.arange(len(self)) < self.guests
 
     def keep(self, mask: NDArray[np.bool_]) -> int:
         """Remove Gaussians.

@@ -1,4 +1,4 @@
-"""The map of a component, grown at the poses of its keyframes and optimized with other frames too.
+"""The map of a component, grown at the poses of its keyframes and optimized with other frames too, tile by tile.
 
 All images are brought to one exposure, that of the map. Some frames between keyframes, never held-out ones, support its
 final optimization; the others are registered to the finished map where depth is not exact.
@@ -18,16 +18,22 @@ from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
+from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.output import BuiltMap, Maps
+from duagc.pipeline.frontend.tile_checkpoints import TileCheckpoints
+from duagc.pipeline.frontend.tiles import Sight, border_keyframes, make_tiles, take_tile
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.view_poses import moved_frames
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration.moving import FreeSpace
+from duagc.pipeline.splat.gaussians import Gaussians
 
 Result = TypeVar("Result")
 
@@ -63,9 +69,17 @@ class MapBuilder:
         """
         self._checkpoints = checkpoints
         self.log, self.config, self.name, self.exposures = log, config, name, exposures
-        self._threads, self._progress = threads, progress
-        self._mapper = Mapper(log.camera, config.mapping, seed, threads=threads, depth_noise_m=noise_m)
+        self._seed, self._noise_m, self._threads, self._progress = seed, noise_m, threads, progress
+        self._depth = config.mapping.depth_kind(noise_m)
+        self._budget = MappingBudget(config.mapping, log.camera)
         self._free = FreeSpace(log.camera, config.moving)
+        self._whole = GrowingMap(config.mapping, threads=threads)
+        self._keyframes: Sequence[Keyframe] = ()
+        self._sights: list[Sight] = []
+        self._tiles: list[list[int]] = []
+        self._centers = np.zeros((0, 3))
+        self._kept: Mapper | None = None  # the last tile that grew
+        self._poses: dict[int, Array] = {}  # T_map_camera of views by frame index, as refined so far
 
     def build(
         self, keyframes: Sequence[Keyframe], frames: Sequence[TrackedFrame], clock: LapTimes
@@ -77,62 +91,179 @@ class MapBuilder:
             frames: every frame of the log.
             clock: its laps get the times of the parts.
         """
-        for keyframe in keyframes:
-            self._free.add(self.log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
+        self._look(keyframes)
         save = self._checkpoints
-        updates, state = save.done(f"{self.name}.mapping", lambda: self._grown(keyframes))
-        self._restore(keyframes, state)
-        unrefined = self._mapper.gaussians
+        updates, state = save.done(f"{self.name}.mapping", self._grown)
+        self._whole.go_on(state)
+        unrefined = self._whole.gaussians
         clock.lap("mapping_s")
-        supporting = supporting_frames(frames, keyframes, self.config)
-        for frame in supporting:
-            self._support(frame, keyframes[frame.keyframe_index])
-        part = f"{self.name}.final"
+        supporting = supporting_frames(frames, keyframes, self.config, tiles=len(self._tiles))
         log_s = 1e-9 * (frames[-1].stamp_ns - frames[0].stamp_ns)
-        wanted, steps = self._mapper.budget.final_steps(
-            len(keyframes), len(keyframes) + len(supporting), log_s
+        stats, self._poses, state = save.done(
+            f"{self.name}.final", lambda: self._finalized(supporting, log_s)
         )
-        self._left_out(wanted - steps, wanted, "of the final optimization", "final_megapixels_s")
-        stats, state = save.done(
-            part, lambda: (self._mapper.finalize(save, part, log_s=log_s), self._mapper.state())
-        )
-        self._mapper.go_on(state)
-        updates.append(self._update(keyframes[-1], stats))
+        self._whole.go_on(state)
+        updates.append(self._update(keyframes[-1], stats, len(self._whole)))
         clock.lap("final_refinement_s")
-        maps = Maps(self._mapper.gaussians, unrefined, self._mapper.depth)
-        before, after = np.array([k.T_map_camera for k in keyframes]), self._mapper.keyframe_poses
-        views = {keyframe.frame_index: T for keyframe, T in zip(keyframes, after, strict=True)}
-        views |= {f.frame_index: T for f, T in zip(supporting, self._mapper.support_poses, strict=True)}
+        maps = Maps(self._whole.gaussians, unrefined, self._depth)
+        before = np.array([k.T_map_camera for k in keyframes])
+        after = np.array([self._poses[k.frame_index] for k in keyframes])
         if not np.array_equal(before, after):
-            frames = moved_frames(frames, before, after, views)
-        registered = self._registered(frames, after, frozenset(views))
+            frames = moved_frames(frames, before, after, self._poses)
+        registered = self._registered(frames, after, frozenset(self._poses))
         clock.lap("model_s")
         return BuiltMap(updates, maps, registered, after)
 
-    def _grown(self, keyframes: Sequence[Keyframe]) -> tuple[list[MapUpdate], Any]:
-        """Add all keyframes to the map; the messages about it, and the state of the map."""
-        part = f"{self.name}.mapping"
+    def _look(self, keyframes: Sequence[Keyframe]) -> None:
+        """Look at all keyframes once: what moves in them, how far they see, and which make a tile."""
+        self._keyframes = keyframes
+        self._poses = {k.frame_index: k.T_map_camera for k in keyframes}
+        for keyframe in keyframes:
+            depth_m = self.log.frame(keyframe.frame_index).usable_depth
+            self._free.add(depth_m, keyframe.T_map_camera)
+            self._sights.append(Sight.of(depth_m, self.log.camera))
+        self._centers = np.array(
+            [
+                se3.transform(k.T_map_camera, sight.center_camera[None])[0]
+                for k, sight in zip(keyframes, self._sights, strict=True)
+            ]
+        )
+        self._tiles = make_tiles(self._centers, self.config.mapping.tile_keyframes)
+
+    def _grown(self) -> tuple[list[MapUpdate], Any]:
+        """Add all keyframes to the map, tile by tile; the messages about it, and the state of the map."""
+        part, count = f"{self.name}.mapping", len(self._keyframes)
         updates: list[MapUpdate] = []
-        done, state = 0, None
+        first, grown = 0, None
         if (saved := self._checkpoints.resume(part)) is not None:
-            done, (updates, state) = saved
-        self._restore(keyframes[:done], state)
-        left = keyframes[done:]
-        steps = self._mapper.budget.keyframe_steps([keyframe.stamp_ns for keyframe in keyframes])
-        wanted = self.config.mapping.iterations * len(keyframes)
+            _, (first, updates, whole, grown) = saved
+            self._whole.go_on(whole)
+        steps = self._budget.keyframe_steps([keyframe.stamp_ns for keyframe in self._keyframes])
+        wanted = self.config.mapping.iterations * count
         self._left_out(wanted - sum(steps), wanted, "at keyframes", "keyframe_megapixels_s")
-        for keyframe in progress_bar.track(left, f"mapping {self.name}") if self._progress else left:
-            add = partial(self._mapper.add_keyframe, iterations=steps[keyframe.keyframe_index])
-            stats = self._with_images(add, keyframe)
-            updates.append(self._update(keyframe, stats))
-            self._checkpoints.at(
-                part,
-                len(updates),
-                len(keyframes),
-                lambda: (updates, self._mapper.state()),
-                shown=lambda: self._mapper.gaussians,
-            )
-        return updates, self._mapper.state()
+        for number, tile in enumerate(self._tiles[first:], first):
+            before = [k for earlier in self._tiles[:number] for k in earlier]
+            done = len(updates) - len(before)
+            mapper = self._mapper(number, before, taken=not done)
+            for k in tile[:done]:
+                self._with_images(mapper.put_back, k)
+            if grown is not None:
+                mapper.go_on(grown)
+            left = tile[done:]
+            for k in progress_bar.track(left, f"mapping {self.name}") if self._progress else left:
+                add = partial(mapper.add_keyframe, iterations=steps[k])
+                stats = self._with_images(add, k)
+                updates.append(self._update(self._keyframes[k], stats, len(self._whole) + stats.total))
+                self._checkpoints.at(
+                    part,
+                    len(updates),
+                    count,
+                    partial(self._growing, number, updates, mapper),
+                    shown=partial(self._shown, mapper),
+                )
+            self._whole.put_back(mapper.growing_map)
+            self._kept = mapper if len(self._tiles) == 1 else None
+            del mapper
+            grown = None
+        return updates, self._whole.state()
+
+    def _growing(self, tile: int, updates: list[MapUpdate], mapper: Mapper) -> tuple[Any, ...]:
+        """From which the growth of the map can go on."""
+        return tile, updates, self._whole.state(), mapper.state()
+
+    def _shown(self, mapper: Mapper) -> Gaussians:
+        return Gaussians.concatenate([self._whole.gaussians, mapper.gaussians])
+
+    def _mapper(
+        self, number: int, others: Sequence[int], *, taken: bool, supporting: Sequence[TrackedFrame] = ()
+    ) -> Mapper:
+        """The mapper of a tile, with the keyframes of others that are nearest.
+
+        Args:
+            number: of the tile.
+            others: keyframes that may be at its border.
+            taken: whether its Gaussians are taken out of the map; else their state follows.
+            supporting: frames between its keyframes that take part.
+        """
+        config, tile = self.config.mapping, self._tiles[number]
+        border = border_keyframes(tile, others, self._centers, config.border_keyframes)
+        begun = GrowingMap(config, threads=self._threads)
+        if taken:
+            seen = [(self._sights[k], self._pose(k)) for k in (*tile, *border)]
+            for frame in supporting:
+                depth_m = self.log.frame(frame.frame_index).usable_depth
+                T_map_camera = self._pose(frame.keyframe_index) @ frame.T_keyframe_camera
+                seen.append((Sight.of(depth_m, self.log.camera), T_map_camera))
+            begun = take_tile(self._whole, tile, seen[: len(tile)], seen[len(tile) :])
+        mapper = Mapper(
+            self.log.camera,
+            config,
+            self._seed,
+            threads=self._threads,
+            depth_noise_m=self._noise_m,
+            begun=begun,
+            tile=number,
+        )
+        for k in border:
+            self._with_images(mapper.add_border, k)
+        return mapper
+
+    def _finalized(
+        self, supporting: Sequence[TrackedFrame], log_s: float
+    ) -> tuple[MappingStats, dict[int, Array], Any]:
+        """Optimize all tiles in turn; counts, poses of the views by frame index, and the state of the map."""
+        part, every = f"{self.name}.final", range(len(self._keyframes))
+        of_tile = [[f for f in supporting if f.keyframe_index in set(tile)] for tile in self._tiles]
+        shares_s = [log_s * len(t) / len(every) if len(self._tiles) > 1 else log_s for t in self._tiles]
+        borders = [
+            len(border_keyframes(t, every, self._centers, self.config.mapping.border_keyframes))
+            for t in self._tiles
+        ]
+        plans = [
+            self._budget.final_steps(len(tile), len(tile) + len(between) + near, share_s)
+            for tile, between, near, share_s in zip(self._tiles, of_tile, borders, shares_s, strict=True)
+        ]
+        wanted, steps = (sum(counts) for counts in zip(*plans, strict=True))
+        self._left_out(wanted - steps, wanted, "of the final optimization", "final_megapixels_s")
+        first, found = 0, None
+        all_stats: list[MappingStats] = []
+        if (saved := self._checkpoints.resume(part)) is not None:
+            _, ((first, whole, self._poses, all_stats), *found) = saved
+            self._whole.go_on(whole)
+        for number, tile in enumerate(self._tiles[first:], first):
+            mapper = self._kept
+            if mapper is not None and len(self._tiles) == 1 and found is None:
+                mapper.begin(take_tile(self._whole, tile, (), ()))  # its images are here
+            else:
+                mapper = self._mapper(number, every, taken=found is None, supporting=of_tile[number])
+                for k in tile:
+                    self._with_images(mapper.put_back, k)
+            for frame in of_tile[number]:
+                self._support(mapper, frame)
+            others = (number, self._whole.state(), self._poses, all_stats)
+            before = sum(taken for _, taken in plans[:number])
+            save = TileCheckpoints(self._checkpoints, others, found=found, before=before, total=steps)
+            all_stats.append(mapper.finalize(save, part, log_s=shares_s[number]))
+            found = None
+            for k, T_map_camera in zip(tile, mapper.keyframe_poses, strict=True):
+                self._poses[self._keyframes[k].frame_index] = T_map_camera
+            for frame, T_map_camera in zip(of_tile[number], mapper.support_poses, strict=True):
+                self._poses[frame.frame_index] = T_map_camera
+            self._whole.put_back(mapper.growing_map)
+        return self._summed(all_stats), self._poses, self._whole.state()
+
+    @staticmethod
+    def _summed(stats: Sequence[MappingStats]) -> MappingStats:
+        """Counts and mean losses of several tiles."""
+        if len(stats) == 1:
+            return stats[0]
+        return MappingStats(
+            inserted=sum(tile.inserted for tile in stats),
+            pruned=sum(tile.pruned for tile in stats),
+            total=stats[-1].total,
+            loss_before=float(np.mean([tile.loss_before for tile in stats])),
+            loss_after=float(np.mean([tile.loss_after for tile in stats])),
+        )
 
     def _left_out(self, steps: int, wanted: int, which: str, setting: str) -> None:
         """Say what a budget leaves out."""
@@ -142,32 +273,31 @@ class MapBuilder:
                 f"by frontend.mapping.{setting}"
             )
 
-    def _restore(self, keyframes: Sequence[Keyframe], state: Any) -> None:
-        """Bring the mapper to a state, with images of the log."""
-        for keyframe in keyframes[len(self._mapper.keyframe_poses) :]:
-            self._with_images(self._mapper.put_back, keyframe)
-        if state is not None:
-            self._mapper.go_on(state)
+    def _pose(self, keyframe: int) -> Array:
+        """T_map_camera of a keyframe, as refined so far."""
+        return self._poses[self._keyframes[keyframe].frame_index]
 
-    def _with_images(self, do: Callable[..., Result], keyframe: Keyframe) -> Result:
+    def _with_images(self, do: Callable[..., Result], index: int) -> Result:
         """Hand a keyframe to the mapper."""
+        keyframe, T_map_camera = self._keyframes[index], self._pose(index)
         frame = self.log.frame(keyframe.frame_index)
         return do(
-            keyframe.keyframe_index,
+            index,
             frame.color,
             frame.depth,
-            keyframe.T_map_camera,
+            T_map_camera,
             mask=self._free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
             exposure=self.exposures.at(frame.index),
             information=keyframe.information,
         )
 
-    def _support(self, supporting: TrackedFrame, keyframe: Keyframe) -> None:
+    def _support(self, mapper: Mapper, supporting: TrackedFrame) -> None:
         """Add a frame to the views of the final optimization."""
         frame = self.log.frame(supporting.frame_index)
-        T_map_camera = keyframe.T_map_camera @ supporting.T_keyframe_camera
-        self._mapper.add_view(
+        T_map_keyframe = self._keyframes[supporting.keyframe_index].T_map_camera
+        T_map_camera = T_map_keyframe @ supporting.T_keyframe_camera
+        mapper.add_view(
             supporting.keyframe_index,
             frame.color,
             frame.depth,
@@ -188,14 +318,14 @@ class MapBuilder:
         if not self.config.model.enabled:
             return list(frames)
         model = ModelTracker(
-            self._mapper.gaussians,
-            self._mapper.depth,
+            self._whole.gaussians,
+            self._depth,
             self.log.camera,
             self.config.model,
             registration=self.config.tracking.registration,
             threads=self._threads,
         )
-        reasons = {Reason.NO_DEPTH} if self._mapper.exact_depth else {Reason.NO_DEPTH, Reason.NONE}
+        reasons = {Reason.NO_DEPTH} if self._depth == "ray_plane" else {Reason.NO_DEPTH, Reason.NONE}
 
         def registered(frame: TrackedFrame) -> TrackedFrame:
             if frame.status is not Status.LOST and frame.reason in reasons and frame.frame_index not in views:
@@ -205,22 +335,22 @@ class MapBuilder:
 
         return self._checkpoints.each(f"{self.name}.model", frames, registered)
 
-    def _update(self, keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
-        """The message about a step of mapping."""
+    def _update(self, keyframe: Keyframe, stats: MappingStats, total: int) -> MapUpdate:
+        """The message about a step of mapping, after which the map has so many Gaussians."""
         return MapUpdate(
             stamp_ns=keyframe.stamp_ns,
             robot=self.name,
             keyframe_index=keyframe.keyframe_index,
             inserted=stats.inserted,
             pruned=stats.pruned,
-            total=stats.total,
+            total=total,
             loss_before=stats.loss_before,
             loss_after=stats.loss_after,
         )
 
 
 def supporting_frames(
-    frames: Sequence[TrackedFrame], keyframes: Sequence[Keyframe], config: FrontendConfig
+    frames: Sequence[TrackedFrame], keyframes: Sequence[Keyframe], config: FrontendConfig, *, tiles: int = 1
 ) -> list[TrackedFrame]:
     """Frames for the final optimization of the map: tracked, no keyframes, not held out; evenly spread over the log.
 
@@ -228,6 +358,7 @@ def supporting_frames(
         frames: of the log.
         keyframes: of the map.
         config: of the front end.
+        tiles: of the map; each gets a share.
     """
     taken = {keyframe.frame_index for keyframe in keyframes}
     candidates = [
@@ -238,5 +369,5 @@ def supporting_frames(
         and frame.frame_index not in taken
         and not is_held_out(frame.frame_index)
     ]
-    count = min(config.mapping.support_views, len(candidates))
+    count = min(tiles * config.mapping.support_views, len(candidates))
     return [candidates[k] for k in evenly_spaced(len(candidates), count)]

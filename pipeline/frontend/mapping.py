@@ -78,8 +78,10 @@ class Mapper:
         *,
         threads: int = 1,
         depth_noise_m: float | None = None,
+        begun: GrowingMap | None = None,
+        tile: int = 0,
     ) -> None:
-        """Begin with an empty map.
+        """Begin with an empty map, or with a tile of one.
 
         Args:
             camera: of all views.
@@ -89,22 +91,30 @@ class Mapper:
             threads: of the rasterizer; changes no bit of the map.
             depth_noise_m: standard deviation of the depth images, meters, for `config.depth` = auto; None:
                 unknown.
+            begun: the Gaussians of a tile of the map; None: an empty map.
+            tile: its number.
         """
-        self.config, self.seed = config, seed
+        self.config, self.seed, self._tile = config, seed, tile
         self.cameras = (camera, camera.halved())
         self.budget = MappingBudget(config, camera)
         self.rasterizer = Rasterizer(threads=threads)
         self.depth = config.depth_kind(depth_noise_m)
         self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())
         self._step = TrainingStep(self.rasterizer, self._loss_weights, self.depth)
-        self._map = GrowingMap(config, threads=threads)
+        self._map = GrowingMap(config, threads=threads) if begun is None else begun
         self._views: list[View] = []
         self._support: list[View] = []
+        self._borders: list[View] = []
 
     @property
     def gaussians(self) -> Gaussians:
         """The map so far, in the map frame."""
         return self._map.gaussians
+
+    @property
+    def growing_map(self) -> GrowingMap:
+        """The Gaussians with all that is known of them."""
+        return self._map
 
     @property
     def exact_depth(self) -> bool:
@@ -136,6 +146,14 @@ class Mapper:
         for view, T_map_camera in zip((*self._views, *self._support), poses, strict=True):
             view.T_map_camera = T_map_camera
 
+    def begin(self, begun: GrowingMap) -> None:
+        """Begin with other Gaussians, and the same views.
+
+        Args:
+            begun: the Gaussians of the tile.
+        """
+        self._map = begun
+
     def put_back(self, *view: Any, **more: Any) -> None:
         """Take in a keyframe of which a state follows, and do nothing for it.
 
@@ -144,6 +162,15 @@ class Mapper:
             more: as of `add_keyframe`.
         """
         self._views.append(View.of(*view, huber_m=self._loss_weights.depth_huber_m, **more))
+
+    def add_border(self, *view: Any, **more: Any) -> None:
+        """Take in a keyframe of another tile, which sees some of this one; its pose stays.
+
+        Args:
+            view: as of `add_keyframe`.
+            more: as of `add_keyframe`.
+        """
+        self._borders.append(View.of(*view, huber_m=self._loss_weights.depth_huber_m, **more))
 
     def add_keyframe(
         self,
@@ -161,7 +188,7 @@ class Mapper:
         """Seed what the map does not explain of a new keyframe and optimize the window around it.
 
         Args:
-            keyframe_index: 0, 1, 2, ... in order of arrival.
+            keyframe_index: 0, 1, 2, ... in order of arrival; a tile has some of them.
             color: RGB [H, W, 3]; kept, not copied.
             depth_m: meters [H, W], 0 where there is none; kept, not copied.
             T_map_camera: [4, 4], pose of the camera in the map frame.
@@ -171,7 +198,8 @@ class Mapper:
             information: [6, 6] of the pose; None: nothing is known of it.
             iterations: most optimization steps; None: those of the configuration.
         """
-        if keyframe_index != len(self._views):
+        last = self._views[-1].index if self._views else -1
+        if keyframe_index <= last or (last < 0 and not self._tile and keyframe_index):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
         view = View.of(
             keyframe_index,
@@ -184,13 +212,13 @@ class Mapper:
             exposure=exposure,
             information=information,
         )
+        first = not self._views and not len(self._map)
         self._views.append(view)
         self._map.adam.freeze_after(self.config.stable_steps or None)
-        inserted, pruned = self._seed(
-            view, self.config.first_share if keyframe_index == 0 else self.config.keyframe_share
-        )
+        inserted, pruned = self._seed(view, self.config.first_share if first else self.config.keyframe_share)
         level = self.config.iterations_level
-        window = optimization_window(self._views, view, self.config, camera=self.cameras[0], seed=self.seed)
+        views = [*self._borders, *self._views]
+        window = optimization_window(views, view, self.config, camera=self.cameras[0], seed=self.seed)
         sparse = SparseSteps(self.config.sparse, self.cameras[level], len(window[:iterations]))
         losses, visits = [], Counter[int]()
         for step, other in enumerate(window[:iterations]):
@@ -228,12 +256,12 @@ class Mapper:
             exposure: of the image; None: as the map.
             information: [6, 6] of the pose; None: nothing is known of it.
         """
-        T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
+        keyframe = next(view for view in self._views if view.index == keyframe_index)
         view = View.of(
             keyframe_index,
             color,
             depth_m,
-            T_map_camera,
+            keyframe.T_map_camera @ T_keyframe_camera,
             mask=mask,
             depth_sigma_m=depth_sigma_m,
             huber_m=self._loss_weights.depth_huber_m,
@@ -259,7 +287,8 @@ class Mapper:
             Counts of the whole optimization, losses as means over all keyframes at full size.
         """
         config = self.config
-        views = [*self._views, *self._support]
+        views = [*self._views, *self._support, *self._borders]
+        fixed = self._fixed_views(len(views))
         first, found = checkpoints.resume(part) or (0, None)
         before, inserted, pruned = (self._mean_loss(), *self._cover()) if found is None else found[0]
         _, steps = self.budget.final_steps(len(self._views), len(views), log_s)
@@ -275,9 +304,7 @@ class Mapper:
             position = step % len(views)
             if position == 0 or step == first:
                 start = step - position
-                order = random_streams.generator(self.seed, "mapping.finish", start=start).permutation(
-                    len(views)
-                )
+                order = self._draw_of(start).permutation(len(views))
             if step in rounds:
                 number = rounds.index(step)
                 half = views[number % 2 :: 2] if len(views) >= MANY_VIEWS else views
@@ -287,13 +314,26 @@ class Mapper:
                 pruned += self._prune_useless(views, len(views))
             share = smoothstep_decay(step, steps, config.final_rate_decay)
             chosen = int(order[position])
-            pose_step = poses.of(chosen, config.pose_rate * share) if refined and chosen else None
+            pose_step = (
+                poses.of(chosen, config.pose_rate * share) if refined and chosen not in fixed else None
+            )
             looked_at = sparse.at(step, visit=step // len(views) + chosen)
-            self._optimize(views[chosen], 0, config.rates.times(share), looked_at, pose_step=pose_step)
+            rates = config.rates.times(share)
+            self._optimize(views[chosen], 0, rates, looked_at, pose_step=pose_step, keep_guests=True)
             state = partial(self._optimized, (before, inserted, pruned), poses)
             checkpoints.at(part, step + 1, steps, state, shown=lambda: self.gaussians)
         pruned += self._map.prune_degenerate()
         return MappingStats(inserted, pruned, len(self._map), before, self._mean_loss())
+
+    def _fixed_views(self, views: int) -> set[int]:
+        """Positions of the views whose poses stay: the first of the map, or those of other tiles."""
+        borders = set(range(views - len(self._borders), views))
+        return borders if borders and self._views[0].index else borders | {0}
+
+    def _draw_of(self, start: int) -> np.random.Generator:
+        """The stream of the order of the views from a step on."""
+        of_tile = {"tile": self._tile} if self._tile else {}
+        return random_streams.generator(self.seed, "mapping.finish", start=start, **of_tile)
 
     def _optimized(self, so_far: tuple[float, int, int], poses: PoseSteps) -> tuple[Any, ...]:
         """From which the final optimization can go on."""
@@ -322,8 +362,9 @@ class Mapper:
         looked_at: LookedAt = EVERYTHING,
         *,
         pose_step: PoseStep | None = None,
+        keep_guests: bool = False,
     ) -> float:
-        """One Adam step of all Gaussians in one view, and of its pose where a step of it is given; the loss before."""
+        """One Adam step of the Gaussians in one view, and of its pose where a step is given; the loss before."""
         loss, gradients = self._step.gradients(
             self._map.gaussians,
             self.cameras[level],
@@ -331,6 +372,8 @@ class Mapper:
             pose=pose_step is not None,
             closing=looked_at.closing,
         )
+        if keep_guests:
+            self._map.keep_guests(gradients)
         self._map.gaussians = self._step.stepped(
             self._map.gaussians,
             gradients,
@@ -356,9 +399,10 @@ class Mapper:
             color = self._as_drawn(view, color, render)
             wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=view.depth_sigma_m)
         new = self._discs(view, color, depth_m, wanted, budget=budget)
-        excess = len(self._map) + len(new) - config.max_gaussians
+        excess = len(self._map) + len(new) - self._map.cap
+        views = [*self._borders, *self._views]
         swept = covisible(
-            self._views, view, config.sweep_keyframes, candidates=config.candidates, camera=self.cameras[0]
+            views, view, config.sweep_keyframes, candidates=config.candidates, camera=self.cameras[0]
         )
         self._map.update_contributions(*self._contributions(swept))
         pruned = self._map.prune_least(excess) if excess > 0 else 0
@@ -400,20 +444,21 @@ class Mapper:
             )
             self._map.append(new)
             inserted += len(new)
-        excess = len(self._map) - config.max_gaussians
+        excess = len(self._map) - self._map.cap
         if excess <= 0:
             return inserted, 0
-        self._map.contribution = self._contributions([*self._views, *self._support])[0]
+        views = [*self._views, *self._support, *self._borders]
+        self._map.contribution = self._contributions(views)[0]
         return inserted, self._map.prune_least(excess)
 
     def _prune_useless(self, looked_at: Sequence[View], views: int) -> int:
         """Remove what contributes nothing to the views that are looked at, of so many; how many there were.
 
-        What none of these views sees stays.
+        What none of some views sees stays, and guests do.
         """
         found, seen = self._contributions(looked_at)
         least = self.config.min_contribution * len(looked_at) / views
-        return self._map.keep((found >= least) | (~seen & (len(looked_at) < views)))
+        return self._map.keep((found >= least) | (~seen & (len(looked_at) < views)) | self._map.is_guest)
 
     def _densify(self, share: float) -> int:
         """Insert discs where keyframes are drawn worst; how many.
@@ -421,7 +466,7 @@ class Mapper:
         `share` of the room below the cap is used. Every keyframe gets an equal part of it, in turn, and sees what
         those before it inserted; no more than an eighth of its finest cells is seeded.
         """
-        room = int(share * (self.config.max_gaussians - len(self._map)))
+        room = int(share * self._map.room)
         inserted = 0
         for k, view in enumerate(self._views):
             budget = room * (k + 1) // len(self._views) - room * k // len(self._views)

@@ -18,7 +18,7 @@ def optimization_window(
     """The views of a keyframe's iterations: every second one the newest, the others in turn.
 
     Args:
-        views: all keyframes.
+        views: those that may be chosen, in the order in which they were added.
         newest: the last of them.
         config: numbers of views and iterations.
         camera: of all views.
@@ -26,7 +26,7 @@ def optimization_window(
     """
     chosen = covisible(views, newest, config.window, candidates=config.candidates, camera=camera)[1:]
     taken = {view.index for view in chosen}
-    rest = [view for view in views[: newest.index] if view.index not in taken]
+    rest = [view for view in views if view is not newest and view.index not in taken]
     draw = random_streams.generator(seed, "mapping.window", keyframe=newest.index)
     random = draw.permutation(len(rest))[: config.random_keyframes]
     others = [*chosen, *(rest[k] for k in random)]
@@ -42,13 +42,13 @@ def covisible(
     """A view, the keyframe before it, and the older ones that see most of what it sees, best first; ties to the later.
 
     Args:
-        views: all keyframes.
+        views: those that may be chosen, in the order in which they were added.
         newest: the view.
         count: number of views returned at most, itself included.
         candidates: number of keyframes compared, those whose center of view is nearest.
         camera: of all views.
     """
-    older = list(views[: newest.index])
+    older = [view for view in views if view is not newest]
     if len(older) > candidates:
         centers = np.stack([view.center_map for view in older])
         distance = np.linalg.norm(centers - newest.center_map, axis=1)

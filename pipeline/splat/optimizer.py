@@ -108,6 +108,19 @@ class Adam:
         self._second = {name: np.concatenate([moments, new[name]]) for name, moments in self._second.items()}
         self._steps = np.concatenate([self._steps, np.zeros(n, np.int32)])
 
+    def append(self, other: Adam) -> None:
+        """Add the Gaussians of another one at the end, with their state.
+
+        Args:
+            other: its state stays as it is.
+        """
+        first, second, steps, _ = other.state()
+        self._first = {name: np.concatenate([moments, first[name]]) for name, moments in self._first.items()}
+        self._second = {
+            name: np.concatenate([moments, second[name]]) for name, moments in self._second.items()
+        }
+        self._steps = np.concatenate([self._steps, steps])
+
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
         """The Gaussians after one step; those without any gradient of color or opacity are untouched.
 

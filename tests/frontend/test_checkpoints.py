@@ -104,6 +104,17 @@ def test_killed_again_and_again_it_ends_with_the_same_bits(
     assert len(runs.steps) <= steps + 2 * (len(runs.steps) // between)  # a kill costs what it falls into
 
 
+def test_killed_in_any_tile_of_the_map_it_ends_with_the_same_bits(log: Path, tmp_path: Path) -> None:
+    mapping = CONFIG.mapping.model_copy(update={"tile_keyframes": 2, "border_keyframes": 1})
+    keyframes = CONFIG.keyframes.model_copy(update={"min_overlap": 0.98})  # many of them
+    config = CONFIG.model_copy(update={"mapping": mapping, "keyframes": keyframes})
+    digest, _ = undisturbed(log, config, tmp_path)
+    runs = Runs(log, tmp_path, config)
+    assert runs.until_done(3) == digest
+    for part, least in (("alpha.mapping", 1), ("alpha.final", 10)):
+        assert len({line for line in runs.said if line.startswith(f"{part}: goes on")}) >= least, runs.said
+
+
 def test_what_is_damaged_is_named_and_computed_again(
     log: Path, expected: tuple[str, int], tmp_path: Path
 ) -> None:

@@ -1,0 +1,161 @@
+"""Tiles of a map: which keyframes make one, what their views see, and that only its own images change a Gaussian."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pytest
+
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.frontend.growing_map import GrowingMap
+from duagc.pipeline.frontend.mapping import Mapper
+from duagc.pipeline.frontend.tiles import Sight, border_keyframes, make_tiles, take_tile
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.splat.gaussians import Gaussians
+from tests.frontend.test_mapping import CAMERA, POSES, QUICK, drawn, same, shot
+
+
+def test_every_keyframe_is_in_one_tile_with_its_neighbors() -> None:
+    rooms = np.array([[0.0, 0, 0], [20, 0, 0], [0, 9, 0]])
+    centers = np.concatenate(
+        [rooms + 0.1 * k for k in range(12)]
+    )  # the rooms are visited in turn, again and again
+    tiles = make_tiles(centers, 12)
+    assert sorted(k for tile in tiles for k in tile) == list(range(len(centers)))
+    assert tiles[0][0] == 0
+    assert max(map(len, tiles)) <= 12
+    assert all(tile == sorted(tile) for tile in tiles)
+    far = next(tile for tile in tiles if 1 in tile)
+    assert {k % 3 for k in far} <= {1, 2} or len(far) > 6
+    assert make_tiles(centers, 36) == [list(range(36))]
+
+
+def test_the_border_is_what_looks_nearest() -> None:
+    centers = np.array([[float(k), 0, 0] for k in range(10)])
+    assert border_keyframes([4, 5], range(10), centers, 2) == [3, 6]
+    assert border_keyframes([4, 5], [0, 1], centers, 5) == [0, 1]
+    assert border_keyframes([4, 5], range(10), centers, 0) == []
+
+
+@pytest.mark.parametrize(
+    ("point", "radius_m", "seen"),
+    [
+        ((0.0, 0.0, 1.9), 0.01, True),
+        ((0.0, 0.0, 2.5), 0.01, False),  # behind the wall
+        ((0.0, 0.0, 2.5), 0.6, True),  # but reaches through it
+        ((0.9, 0.0, 2.5), 0.01, True),  # where nothing was measured
+        ((0.0, 0.0, -1.0), 0.01, False),
+        ((3.0, 0.0, 1.5), 0.01, False),  # outside of the image
+        ((3.0, 0.0, 1.5), 2.5, True),
+    ],
+)
+def test_a_view_sees_what_is_in_it_and_not_behind_its_depth(
+    point: tuple[float, float, float], radius_m: float, seen: bool
+) -> None:
+    depth_m = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
+    depth_m[:, 44:] = 0.0
+    T_map_camera = se3.exp(np.array([0.3, -0.2, 0.1, 0.2, 0.4, -0.1]))
+    means = se3.transform(T_map_camera, np.array([point])).astype(np.float32)
+    found = Sight.of(depth_m, CAMERA).sees(means, np.array([radius_m], np.float32), T_map_camera)
+    assert found.tolist() == [seen]
+
+
+def _grown(views: int) -> GrowingMap:
+    mapper = Mapper(CAMERA, QUICK, seed=5)
+    for k in range(views):
+        mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
+    return mapper.growing_map
+
+
+def _sights(keyframes: Iterable[int]) -> list[tuple[Sight, np.ndarray]]:
+    return [(Sight.of(shot(POSES[k])[1], CAMERA), POSES[k]) for k in keyframes]
+
+
+def _by_id(gaussians: Gaussians) -> Gaussians:
+    return gaussians.select(np.argsort(gaussians.ids, kind="stable"))
+
+
+def test_what_is_taken_out_and_put_back_is_the_same_map() -> None:
+    whole = _grown(3)
+    before, moments = whole.gaussians, whole.adam.state()[1]["means"]
+    part = take_tile(whole, [1], _sights([1]), _sights([2]))
+    assert 0 < part.guests < len(part)
+    assert (part.gaussians.anchors[part.guests :] == 1).all()
+    assert not (whole.gaussians.anchors == 1).any()
+    whole.put_back(part)
+    order = np.argsort(whole.gaussians.ids, kind="stable")
+    assert same(whole.gaussians.select(order), before)
+    assert np.array_equal(whole.adam.state()[1]["means"][order], moments)
+    assert whole.next_id == part.next_id
+
+
+def _border(mapper: Mapper, keyframes: Iterable[int]) -> None:
+    for k in keyframes:
+        mapper.add_border(k, *shot(POSES[k]), POSES[k], mask=None, depth_sigma_m=None)
+
+
+def test_only_the_images_of_its_tile_change_a_gaussian_in_the_end() -> None:
+    whole = _grown(2)
+    ids = whole.gaussians.ids
+    part = take_tile(whole, [2, 3], _sights([2, 3]), _sights([1]))
+    assert part.guests == len(part) > 0
+    mapper = Mapper(CAMERA, QUICK, seed=5, begun=part, tile=1)
+    _border(mapper, [1])
+    for k in (2, 3):
+        mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
+    mapper.add_view(3, *shot(POSES[3] @ se3.exp(np.full(6, 0.01))), se3.exp(np.full(6, 0.01)))
+    guests = _by_id(mapper.gaussians.select(mapper.growing_map.is_guest))
+    stats = mapper.finalize()
+    assert stats.loss_after < stats.loss_before
+    whole.put_back(mapper.growing_map)
+    old = np.isin(whole.gaussians.ids, ids)
+    assert same(_by_id(whole.gaussians.select(np.isin(whole.gaussians.ids, guests.ids))), guests)
+    assert set(whole.gaussians.anchors[~old].tolist()) == {2, 3}
+
+
+def _tiled(config: MappingConfig, tiles: Sequence[Sequence[int]], threads: int = 1) -> Mapper:
+    """A mapper of the whole map that tiles were made of."""
+    whole = GrowingMap(config)
+    for final in (False, True):
+        for number, tile in enumerate(tiles):
+            others = [k for t in (tiles if final else tiles[:number]) for k in t if k not in tile]
+            part = take_tile(whole, tile, _sights(tile), _sights(others))
+            mapper = Mapper(CAMERA, config, seed=5, threads=threads, begun=part, tile=number)
+            _border(mapper, others)
+            for k in tile:
+                if final:
+                    mapper.put_back(k, *shot(POSES[k]), POSES[k], mask=None, depth_sigma_m=None)
+                else:
+                    mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
+            if final:
+                mapper.finalize()
+            whole.put_back(mapper.growing_map)
+    return Mapper(CAMERA, config, seed=5, begun=whole)
+
+
+def test_tiles_are_drawn_as_well_as_one_map_with_the_same_bits_whatever_the_threads() -> None:
+    config = MappingConfig(max_gaussians=4000, iterations=20, final_iterations=15)
+    one = Mapper(CAMERA, config, seed=5)
+    for k in range(4):
+        one.add_keyframe(k, *shot(POSES[k]), POSES[k])
+    one.finalize()
+    tiled = _tiled(config, ([0, 1], [2, 3]))
+    between = POSES[1] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[1]) @ POSES[2]))
+    for T_map_camera in (POSES[0], between, POSES[3]):
+        assert drawn(tiled, T_map_camera)[0] > drawn(one, T_map_camera)[0] - 1.0
+    assert same(tiled.gaussians, _tiled(config, ([0, 1], [2, 3]), threads=3).gaussians)
+
+
+def test_guests_leave_room_for_what_a_tile_adds() -> None:
+    config = QUICK.model_copy(update={"max_gaussians": 100})
+    crowded = GrowingMap(config)
+    crowded.append(_grown(1).gaussians)
+    guests = len(crowded)
+    assert guests > 100
+    part = crowded.take(np.arange(guests), np.zeros(0, np.int64), uncounted=0)
+    assert part.cap == guests + 50
+    assert part.room == 0
+    assert part.prune_least(10) == 0  # there are only guests
+    part.put_back(crowded)
+    free = part.take(np.arange(guests), np.zeros(0, np.int64), uncounted=guests)
+    assert free.cap == guests + 100
+    assert free.room == 100
