@@ -48,8 +48,8 @@ class MappingConfig(Config):
     """Hard cap of a tile. When a keyframe would exceed it, Gaussians whose removal changes keyframes least go first."""
     tile_keyframes: int = Field(default=64, ge=2)
     """Most keyframes of a tile: a longer log has a map of several, each optimized with the images of its keyframes."""
-    border_keyframes: int = Field(default=16, ge=0)
-    """Most keyframes of other tiles, the nearest, whose images take part in the optimization of a tile."""
+    border_keyframes: int = Field(default=24, ge=0)
+    """Most keyframes of other tiles that look into a tile whose images take part in its optimization."""
     first_share: float = 0.35
     """Share of the cap that the first keyframe may fill."""
     keyframe_share: float = 0.12

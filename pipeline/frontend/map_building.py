@@ -77,7 +77,6 @@ class MapBuilder:
         self._keyframes: Sequence[Keyframe] = ()
         self._sights: list[Sight] = []
         self._tiles: list[list[int]] = []
-        self._centers = np.zeros((0, 3))
         self._kept: Mapper | None = None  # the last tile that grew
         self._poses: dict[int, Array] = {}  # T_map_camera of views by frame index, as refined so far
 
@@ -122,13 +121,11 @@ class MapBuilder:
             depth_m = self.log.frame(keyframe.frame_index).usable_depth
             self._free.add(depth_m, keyframe.T_map_camera)
             self._sights.append(Sight.of(depth_m, self.log.camera))
-        self._centers = np.array(
-            [
-                se3.transform(k.T_map_camera, sight.center_camera[None])[0]
-                for k, sight in zip(keyframes, self._sights, strict=True)
-            ]
-        )
-        self._tiles = make_tiles(self._centers, self.config.mapping.tile_keyframes)
+        centers = [
+            se3.transform(k.T_map_camera, sight.center_camera[None])[0]
+            for k, sight in zip(keyframes, self._sights, strict=True)
+        ]
+        self._tiles = make_tiles(np.array(centers), self.config.mapping.tile_keyframes)
 
     def _grown(self) -> tuple[list[MapUpdate], Any]:
         """Add all keyframes to the map, tile by tile; the messages about it, and the state of the map."""
@@ -186,7 +183,7 @@ class MapBuilder:
             supporting: frames between its keyframes that take part.
         """
         config, tile = self.config.mapping, self._tiles[number]
-        border = border_keyframes(tile, others, self._centers, config.border_keyframes)
+        border = self._border(tile, others)
         begun = GrowingMap(config, threads=self._threads)
         if taken:
             seen = [(self._sights[k], self._pose(k)) for k in (*tile, *border)]
@@ -208,6 +205,13 @@ class MapBuilder:
             self._with_images(mapper.add_border, k)
         return mapper
 
+    def _border(self, tile: Sequence[int], others: Sequence[int]) -> list[int]:
+        """Keyframes of other tiles, out of some, that take part in the optimization of a tile."""
+        if len(self._tiles) == 1:
+            return []
+        views = [(s, k.T_map_camera) for s, k in zip(self._sights, self._keyframes, strict=True)]
+        return border_keyframes(tile, others, views, self.config.mapping.border_keyframes)
+
     def _finalized(
         self, supporting: Sequence[TrackedFrame], log_s: float
     ) -> tuple[MappingStats, dict[int, Array], Any]:
@@ -215,10 +219,7 @@ class MapBuilder:
         part, every = f"{self.name}.final", range(len(self._keyframes))
         of_tile = [[f for f in supporting if f.keyframe_index in set(tile)] for tile in self._tiles]
         shares_s = [log_s * len(t) / len(every) if len(self._tiles) > 1 else log_s for t in self._tiles]
-        borders = [
-            len(border_keyframes(t, every, self._centers, self.config.mapping.border_keyframes))
-            for t in self._tiles
-        ]
+        borders = [len(self._border(tile, every)) for tile in self._tiles]
         plans = [
             self._budget.final_steps(len(tile), len(tile) + len(between) + near, share_s)
             for tile, between, near, share_s in zip(self._tiles, of_tile, borders, shares_s, strict=True)

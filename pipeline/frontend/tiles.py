@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.growing_map import GrowingMap
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import back_project
+from duagc.pipeline.geometry.statistics import evenly_spaced
 
 BLOCKS = 40
 """Blocks across an image in which the farthest depth is kept."""
@@ -26,6 +29,10 @@ BEHIND_M, BEHIND = 0.05, 0.02
 SIGMAS = 3.0
 """Radius of a Gaussian, in its largest standard deviation."""
 NEAR_M = 0.05
+POINTS_APART = 5
+"""Blocks between the points of a view that are kept."""
+BORDER_SHARE = 0.05
+"""Share of the points of a tile from which a view of another tile is at its border."""
 
 Indices = NDArray[np.int64]
 
@@ -54,23 +61,6 @@ def make_tiles(centers_map: Array, most: int) -> list[list[int]]:
     return sorted(([int(k) for k in tile] for tile in tiles), key=lambda tile: tile[0])
 
 
-def border_keyframes(tile: Sequence[int], others: Iterable[int], centers_map: Array, most: int) -> list[int]:
-    """Keyframes of other tiles that look nearest to where those of a tile look, ascending.
-
-    Args:
-        tile: its keyframes.
-        others: those that may be chosen.
-        centers_map: [k, 3], what each keyframe looks at.
-        most: how many.
-    """
-    others = sorted(set(others) - set(tile))
-    if not others or not most:
-        return []
-    centers = centers_map[list(tile)]
-    distance = [float(np.linalg.norm(centers - centers_map[k], axis=1).min()) for k in others]
-    return sorted(others[k] for k in np.argsort(distance, kind="stable")[:most])
-
-
 @dataclass(frozen=True)
 class Sight:
     """How far a view sees.
@@ -79,11 +69,13 @@ class Sight:
         camera: of the view.
         farthest_m: float32 [h, w], the farthest depth around each block of its image; infinite where one is unknown.
         center_camera: [3], what it looks at: on its axis, at the median depth.
+        points_camera: float32 [n, 3], some points of what it sees.
     """
 
     camera: PinholeCamera
     farthest_m: NDArray[np.float32]
     center_camera: Array
+    points_camera: NDArray[np.float32]
 
     @staticmethod
     def of(depth_m: NDArray[np.float32], camera: PinholeCamera) -> Sight:
@@ -101,7 +93,12 @@ class Sight:
         blocks = known.reshape(height, side, width, side).max(axis=(1, 3))
         near = depth_m[::8, ::8]
         median_m = float(np.median(near[near > 0])) if near.any() else 0.0
-        return Sight(camera, ndimage.maximum_filter(blocks, 3), np.array([0.0, 0.0, median_m]))
+        center = np.array([0.0, 0.0, median_m])
+        first, step = POINTS_APART * side // 2, POINTS_APART * side
+        v, u = np.nonzero(depth_m[first::step, first::step])
+        v, u = first + step * v, first + step * u
+        points = back_project(camera, u, v, depth_m[v, u]).astype(np.float32)
+        return Sight(camera, ndimage.maximum_filter(blocks, 3), center, points)
 
     def sees(
         self, means_map: NDArray[np.float32], radii_m: NDArray[np.float32], T_map_camera: Array
@@ -132,6 +129,30 @@ class Sight:
         farthest = self.farthest_m[row, column]
         seen[rows] = z - reach <= np.float32(1 + BEHIND) * farthest + np.float32(BEHIND_M)
         return seen
+
+
+def border_keyframes(
+    tile: Sequence[int], others: Iterable[int], views: Sequence[tuple[Sight, Array]], most: int
+) -> list[int]:
+    """Keyframes of other tiles that look into what a tile shows, evenly spread over all of them, ascending.
+
+    Args:
+        tile: its keyframes.
+        others: those that may be chosen.
+        views: what every keyframe sees, and its pose.
+        most: how many.
+    """
+    points = np.concatenate(
+        [se3.transform(T, sight.points_camera).astype(np.float32) for sight, T in (views[k] for k in tile)]
+    )
+    radii_m = np.zeros(len(points), np.float32)
+    least = BORDER_SHARE * len(points)
+    near = []
+    for k in sorted(set(others) - set(tile)):
+        sight, T_map_camera = views[k]
+        if np.count_nonzero(sight.sees(points, radii_m, T_map_camera)) >= max(least, 1):
+            near.append(k)
+    return [near[k] for k in evenly_spaced(len(near), min(most, len(near)))]
 
 
 def take_tile(

@@ -29,11 +29,13 @@ def test_every_keyframe_is_in_one_tile_with_its_neighbors() -> None:
     assert make_tiles(centers, 36) == [list(range(36))]
 
 
-def test_the_border_is_what_looks_nearest() -> None:
-    centers = np.array([[float(k), 0, 0] for k in range(10)])
-    assert border_keyframes([4, 5], range(10), centers, 2) == [3, 6]
-    assert border_keyframes([4, 5], [0, 1], centers, 5) == [0, 1]
-    assert border_keyframes([4, 5], range(10), centers, 0) == []
+def test_the_border_looks_into_the_tile_from_all_sides() -> None:
+    sight = Sight.of(np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), CAMERA)
+    along = [(sight, se3.exp(np.array([0.5 * k, 0, 0, 0, 0, 0]))) for k in range(20)]
+    assert border_keyframes([9, 10], range(20), along, 100) == [*range(5, 9), *range(11, 15)]
+    assert border_keyframes([9, 10], range(20), along, 4) == [6, 8, 12, 14]
+    assert border_keyframes([9, 10], range(3), along, 4) == []
+    assert border_keyframes([9, 10], range(20), along, 0) == []
 
 
 @pytest.mark.parametrize(
