@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
@@ -20,6 +21,7 @@ def insert_first_keyframe(state: TrackingState, frame: CurrentFrame, reference: 
         frame: the current frame.
         reference: its samples.
     """
+    shelved = SHELF.put((reference, frame.features, frame.pyramid.levels[-1]))
     state.keyframes.append(
         TrackedKeyframe(
             keyframe_index=len(state.keyframes),
@@ -27,9 +29,9 @@ def insert_first_keyframe(state: TrackingState, frame: CurrentFrame, reference: 
             stamp_ns=frame.stamp_ns,
             previous_index=-1,
             T_map_keyframe=np.eye(4),
-            reference=reference,
-            features=frame.features,
-            coarsest=frame.pyramid.levels[-1],
+            reference=shelved[0],
+            features=shelved[1],
+            coarsest=shelved[2],
         )
     )
 
@@ -54,6 +56,8 @@ def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: PoseCand
     state.pairs += _neighbor_registrations(state, frame, previous.keyframe_index, T_map_keyframe)
     gain_before, offset_before = previous.exposure
     gain, offset = result.exposure
+    reference = Reference.from_pyramid(frame.pyramid, state.config.tracking.strides)
+    shelved = SHELF.put((reference, frame.features, frame.pyramid.levels[-1]))
     state.keyframes.append(
         TrackedKeyframe(
             keyframe_index=new,
@@ -61,9 +65,9 @@ def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: PoseCand
             stamp_ns=frame.stamp_ns,
             previous_index=previous.keyframe_index,
             T_map_keyframe=T_map_keyframe,
-            reference=Reference.from_pyramid(frame.pyramid, state.config.tracking.strides),
-            features=frame.features,
-            coarsest=frame.pyramid.levels[-1],
+            reference=shelved[0],
+            features=shelved[1],
+            coarsest=shelved[2],
             exposure=(gain * gain_before, gain * offset_before + offset),
         )
     )

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -55,7 +56,7 @@ class FreeSpace:
             T_map_camera: [4, 4].
         """
         if self.config.enabled:
-            self._views.append(self._view(depth_m, T_map_camera))
+            self._views.append(SHELF.put(self._view(depth_m, T_map_camera)))
 
     def moving(self, depth_m: Image, T_map_camera: Array) -> Mask:
         """Pixels [h, w] of a view that show what was not there in other views of the set; it may be one of them.

@@ -1,0 +1,121 @@
+"""Arrays of long computations, laid into files: what is not looked at takes no memory.
+
+The arrays of an object are written into a nameless temporary file, which is mapped into memory, and are read from there
+when they are looked at. The system takes the pages back now and then. Values stay the same to the last bit.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import sys
+import tempfile
+import weakref
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+Value = TypeVar("Value")
+ALIGNMENT = 64
+LEAST_BYTES = 64 << 10
+"""Objects of less stay in memory."""
+SWEEP_AFTER = 16
+"""Objects, after which all pages are given back that were looked at since."""
+
+
+class _Mapping(mmap.mmap):
+    """A mapped file, of which a weak reference can be had."""
+
+
+class Shelf:
+    """Lays arrays into files, as long as there is room on the disk."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._mappings: weakref.WeakSet[_Mapping] = weakref.WeakSet()
+        self._new = 0
+        self._full = False
+
+    def __len__(self) -> int:
+        """Objects that are in files."""
+        return len(self._mappings)
+
+    def put(self, value: Value) -> Value:
+        """An equal object, whose arrays are in a file and cannot be written.
+
+        Args:
+            value: data classes and tuples with arrays; what is None or anything else is taken as it is.
+        """
+        arrays: list[np.ndarray] = []
+        _collect(value, arrays)
+        sizes = [-(-array.nbytes // ALIGNMENT) * ALIGNMENT for array in arrays]
+        if self._full or sum(sizes) < LEAST_BYTES:
+            return value
+        mapping = self._written(arrays, sizes)
+        if mapping is None:
+            return value
+        starts = np.cumsum([0, *sizes])[:-1].tolist()
+        views = [
+            np.frombuffer(mapping, array.dtype, array.size, start).reshape(array.shape)
+            if array.size
+            else array
+            for array, start in zip(arrays, starts, strict=True)
+        ]
+        shelved: Value = _rebuilt(value, iter(views))
+        self._new += 1
+        if self._new >= SWEEP_AFTER:
+            self.sweep()
+        return shelved
+
+    def sweep(self) -> None:
+        """Give the memory of all files back until they are looked at again."""
+        self._new = 0
+        for mapping in list(self._mappings):
+            mapping.madvise(mmap.MADV_DONTNEED)
+
+    def _written(self, arrays: list[np.ndarray], sizes: list[int]) -> _Mapping | None:
+        """A file with the arrays; None if there is no room for it."""
+        try:
+            with tempfile.TemporaryFile(prefix="duagc-") as file:
+                for array, size in zip(arrays, sizes, strict=True):
+                    file.write(array.tobytes())
+                    file.write(bytes(size - array.nbytes))
+                file.flush()
+                mapping = _Mapping(file.fileno(), sum(sizes), prot=mmap.PROT_READ)
+        except OSError as error:
+            self._full = True
+            place = tempfile.gettempdir()
+            reason = error.strerror or os.strerror(error.errno or 0)
+            print(f"warning: {place}: {reason}; keyframes stay in memory", file=sys.stderr)
+            return None
+        self._mappings.add(mapping)
+        return mapping
+
+
+def _collect(value: Any, arrays: list[np.ndarray]) -> None:
+    """All arrays of an object, in order."""
+    if isinstance(value, np.ndarray):
+        arrays.append(value)
+    elif isinstance(value, tuple):
+        for part in value:
+            _collect(part, arrays)
+    elif is_dataclass(value):
+        for field in fields(value):
+            _collect(getattr(value, field.name), arrays)
+
+
+def _rebuilt(value: Any, views: Iterator[np.ndarray]) -> Any:
+    """The object with other arrays, in the same order."""
+    if isinstance(value, np.ndarray):
+        return next(views)
+    if isinstance(value, tuple):
+        return tuple(_rebuilt(part, views) for part in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value)(**{f.name: _rebuilt(getattr(value, f.name), views) for f in fields(value)})
+    return value
+
+
+SHELF = Shelf()
+"""Of this process."""

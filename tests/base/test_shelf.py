@@ -1,0 +1,68 @@
+"""Arrays in files: equal, read-only, given back, and in memory where there is no room."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from duagc.pipeline.base import shelf
+
+
+@dataclass(frozen=True)
+class _Picture:
+    name: str
+    pixels: np.ndarray
+    mask: np.ndarray | None
+    parts: tuple["_Picture", ...] = ()
+
+
+def _picture(seed: int) -> _Picture:
+    rng = np.random.default_rng(seed)
+    part = _Picture("part", rng.normal(size=(50, 7)).astype(np.float32), None)
+    return _Picture("whole", rng.normal(size=(100, 300))[:, ::2], np.zeros((0, 3), bool), (part,))
+
+
+def _resident_kb() -> int:
+    status = Path("/proc/self/status").read_text().split()
+    return int(status[status.index("RssFile:") + 1])
+
+
+def test_what_is_put_on_the_shelf_is_equal_and_cannot_be_written() -> None:
+    value, kept = _picture(0), shelf.Shelf()
+    found = kept.put(value)
+    assert found.name == value.name
+    assert found.mask is value.mask
+    for a, b in ((found, value), (found.parts[0], value.parts[0])):
+        assert np.array_equal(a.pixels, b.pixels)
+        assert a.pixels.dtype == b.pixels.dtype
+        assert not a.pixels.flags.writeable
+    assert len(kept) == 1
+    del found, a
+    assert len(kept) == 0  # the file is gone with what was in it
+
+
+def test_pages_are_given_back_and_come_again() -> None:
+    kept = shelf.Shelf()
+    values = [kept.put((np.full(1_000_000, k, np.float64),)) for k in range(5)]
+    assert [float(value[0].sum()) for value in values] == [1e6 * k for k in range(5)]
+    before = _resident_kb()
+    kept.sweep()
+    assert _resident_kb() < before - 30_000
+    assert [float(value[0].sum()) for value in values] == [1e6 * k for k in range(5)]
+
+
+def test_small_objects_stay_in_memory() -> None:
+    value, kept = (np.zeros(10),), shelf.Shelf()
+    assert kept.put(value) is value
+    assert len(kept) == 0
+
+
+def test_without_room_it_says_so_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(shelf.tempfile, "tempdir", str(tmp_path / "gone"))
+    value, kept = _picture(0), shelf.Shelf()
+    assert kept.put(value) is value
+    assert kept.put(value) is value
+    assert capsys.readouterr().err.count("stay in memory") == 1
