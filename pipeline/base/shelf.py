@@ -11,9 +11,9 @@ import os
 import sys
 import tempfile
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 import numpy as np
 
@@ -119,3 +119,37 @@ def _rebuilt(value: Any, views: Iterator[np.ndarray]) -> Any:
 
 SHELF = Shelf()
 """Of this process."""
+
+
+class ShelvedList(Sequence[Value]):
+    """Objects whose arrays are in files; of those that were looked at, the last few are in memory."""
+
+    def __init__(self, values: Iterable[Value] = (), shelf: Shelf = SHELF) -> None:
+        """Put objects into a list.
+
+        Args:
+            values: one after the other, so that not all need to be in memory.
+            shelf: where their arrays go.
+        """
+        self._shelf, self._looked_at = shelf, 0
+        self._values: list[Value] = []
+        for value in values:
+            self._values.append(shelf.put(value))
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    @overload
+    def __getitem__(self, index: int) -> Value: ...
+    @overload
+    def __getitem__(self, index: slice) -> ShelvedList[Value]: ...
+    def __getitem__(self, index: int | slice) -> Value | ShelvedList[Value]:
+        if isinstance(index, slice):
+            part: ShelvedList[Value] = ShelvedList(shelf=self._shelf)
+            part._values = self._values[index]
+            return part
+        self._looked_at += 1
+        if self._looked_at >= SWEEP_AFTER:
+            self._looked_at = 0
+            self._shelf.sweep()
+        return self._values[index]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
@@ -103,7 +104,7 @@ def run_fusion(
         [result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames]
     )
     context = MapContext(own.camera, config, matching, own.depth, weights, threads, seed=seed)
-    views: list[PosedRgbd] = []
+    views: Sequence[PosedRgbd] = []
     if len(result.component) > 1:
         num_support = config.finetune.support_views
         views = training_views(source, frames, T_world_camera, num_support=num_support, moving=moving)
@@ -225,7 +226,7 @@ def training_views(
     *,
     num_support: int,
     moving: MovingConfig,
-) -> list[PosedRgbd]:
+) -> Sequence[PosedRgbd]:
     """The robot's keyframes and, evenly spread, frames between them; none held out.
 
     Args:
@@ -241,20 +242,22 @@ def training_views(
     others = [k for k, f in enumerate(frames) if f.frame_index not in keyframes and not f.held_out]
     count = min(num_support, len(others))
     middles = [others[k] for k in evenly_spaced(len(others), count)]
-    views, exposures = [], read_exposures(source.frontend, source.robot)
+    exposures = read_exposures(source.frontend, source.robot)
     with open_rgbd(source.log) as log:
         stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
         log.move_depth(Trajectory(stamps, np.array([frame.T_map_camera for frame in frames])))
         free = FreeSpace(log.camera, moving)
-        for k in (*first, *middles):
-            frame = log.frame(frames[k].frame_index)
+
+        def posed(k: int) -> PosedRgbd:
+            frame, T = log.frame(frames[k].frame_index), T_world_camera[k]
             usable = frame.usable_depth
             if frames[k].frame_index in keyframes:
-                free.add(usable, T_world_camera[k])
+                free.add(usable, T)
             exposure = exposures.at(frame.index)
-            T = T_world_camera[k]
-            views.append(PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure))
-    return [replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views]
+            return PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure)
+
+        views = ShelvedList(map(posed, (*first, *middles)))
+    return ShelvedList(replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views)
 
 
 def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
@@ -61,12 +62,13 @@ def run_information(
                 f"expected less than the {len(log)} frames of {log_path.name}"
             )
         exposures = read_exposures(frontend_path, final.robot)
-        images = []
-        for keyframe in keyframes:
-            frame = log.frame(keyframe.frame_index)
+
+        def posed(keyframe: Keyframe) -> PosedRgbd:
+            frame, T = log.frame(keyframe.frame_index), keyframe.T_map_camera
             exposure = exposures.at(frame.index)
-            T = keyframe.T_map_camera
-            images.append(PosedRgbd(frame.color, frame.depth, T, frame.mask, frame.depth_sigma, exposure))
+            return PosedRgbd(frame.color, frame.depth, T, frame.mask, frame.depth_sigma, exposure)
+
+        images = ShelvedList(map(posed, keyframes))
         camera = log.camera
     images = without_moving(images, camera, moving)
     views = MapViews(final.gaussians, camera, images, final.depth, threads)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry import se3
@@ -50,13 +51,19 @@ class MapViews:
 
 def without_moving(
     images: Sequence[PosedRgbd], camera: PinholeCamera, config: MovingConfig
-) -> list[PosedRgbd]:
+) -> ShelvedList[PosedRgbd]:
     """The images with what moved masked, as the front end did before it mapped them."""
     free = FreeSpace(camera, config)
-    depths = [v.depth_m if v.mask is None else np.where(v.mask, v.depth_m, np.float32(0)) for v in images]
-    for image, depth_m in zip(images, depths, strict=True):
-        free.add(depth_m, image.T_world_camera)
-    return [
-        replace(image, mask=free.usable(depth_m, image.T_world_camera, image.mask))
-        for image, depth_m in zip(images, depths, strict=True)
-    ]
+    for image in images:
+        free.add(_usable_depth(image), image.T_world_camera)
+    return ShelvedList(
+        replace(image, mask=free.usable(_usable_depth(image), image.T_world_camera, image.mask))
+        for image in images
+    )
+
+
+def _usable_depth(image: PosedRgbd) -> NDArray[np.float32]:
+    """The depth of an image, 0 also where its mask forbids the pixel."""
+    if image.mask is None:
+        return image.depth_m
+    return np.where(image.mask, image.depth_m, np.float32(0))

@@ -66,3 +66,14 @@ def test_without_room_it_says_so_once(
     assert kept.put(value) is value
     assert kept.put(value) is value
     assert capsys.readouterr().err.count("stay in memory") == 1
+
+
+def test_a_list_gives_back_what_was_looked_at() -> None:
+    kept = shelf.Shelf()
+    values = shelf.ShelvedList(((np.full(250_000, k, np.float64),) for k in range(40)), kept)
+    for _ in range(2):
+        before = _resident_kb()
+        assert [float(value[0].mean()) for value in values] == list(range(40))
+        assert _resident_kb() - before < 2.5 * shelf.SWEEP_AFTER * 2000  # of 40 x 2000 kB
+    assert [float(value[0][0]) for value in values[30::5]] == [30.0, 35.0]
+    assert float(values[-1][0][0]) == 39.0
