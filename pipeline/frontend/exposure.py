@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
+from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.exposure import ExposureConfig
 from duagc.pipeline.config.frontend import is_held_out
 from duagc.pipeline.frontend.failure import Reason
@@ -187,7 +188,7 @@ class ExposureEstimation:
         """
         if self.config.mode == "off":
             return ExposureTrack()
-        blocks = [self._blocks(index) for index in keyframes]
+        blocks = ShelvedList(map(self._blocks, keyframes))
 
         def of_pair(pair: Pair) -> list[ComparedPair]:
             i, j = pair

@@ -39,7 +39,7 @@ from duagc.pipeline.frontend.output import (
     submap_messages,
     write_log,
 )
-from duagc.pipeline.frontend.pose_optimization import PathOptimization
+from duagc.pipeline.frontend.pose_optimization import OptimizedPath, PathOptimization
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
@@ -263,8 +263,12 @@ class _ComponentStage:
         """
         log, clock, save = self.log, self.clock, self.checkpoints
         part = f"{self.name}.poses"
-        optimization = PathOptimization(_images(log), self.config, self.seed, log.robot, save, part)
-        optimized = save.done(part, lambda: optimization.run(component.keyframes, frames, component.pairs))
+
+        def optimize() -> OptimizedPath:
+            optimization = PathOptimization(_images(log), self.config, self.seed, log.robot, save, part)
+            return optimization.run(component.keyframes, frames, component.pairs)
+
+        optimized = save.done(part, optimize)  # the images that it kept are gone now
         solution, frames = optimized.solution, optimized.frames
         log.move_depth(_trajectory(frames, solution.T_map_keyframe))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
