@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +17,7 @@ from duagc.pipeline.base.machine import processors
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.bench.tables import markdown
 from duagc.pipeline.bench.whole_runs import THIS, execute, part_of, seconds_of
-from duagc.pipeline.recording import Recording
+from duagc.pipeline.recording import RECORDING_FILE, Recording
 
 SCHEMA = 1
 
@@ -29,12 +31,15 @@ class LengthPlan:
         seconds: lengths of the logs, from the beginning.
         threads: processors that a run may use.
         options: more words for `duagc run`.
+        keep: folder where parts of the recording and runs stay: what is there already is not run again, and what was
+            stopped goes on. None: nothing stays.
     """
 
     recording: Path
     seconds: tuple[float, ...]
     threads: int = 2
     options: tuple[str, ...] = ()
+    keep: Path | None = None
 
 
 def run(plan: LengthPlan) -> dict[str, Any]:
@@ -67,29 +72,52 @@ def run(plan: LengthPlan) -> dict[str, Any]:
 
 
 def _rows(plan: LengthPlan, source: Recording) -> Iterator[dict[str, Any]]:
-    with tempfile.TemporaryDirectory(prefix="duagc-bench-") as name:
-        folder = Path(name)
-        for number, seconds in enumerate(sorted(plan.seconds)):
-            part = part_of(source, len(source.robots), seconds, folder / f"recording{number}")
-            out = folder / f"run{number}"
-            done = execute(THIS, part.path, out, processors=plan.threads, options=plan.options)
-            front = [row for row in done.stages.values() if row["stage"] == "frontend"]
-            own = done.metrics["rendering"]["own"]["held_out"]
-            team = done.metrics["team"]
-            yield {
-                "seconds": seconds,
-                "frames": sum(row["frames"] for row in done.metrics["robots"].values()),
-                "cpu_s": round(sum(row["cpu_s"] for row in done.stages.values()) / len(source.robots), 3),
-                "frontend_cpu_s": round(sum(row["cpu_s"] for row in front) / len(front), 3),
-                "wall_s": round(done.wall_s, 3),
-                "frontend_peak_mb": max(row["peak_rss_mb"] for row in front),
-                "peak_memory_mb": max(row["peak_rss_mb"] for row in done.stages.values()),
-                "gaussians": sum(row["gaussians"] for row in done.metrics["robots"].values()),
-                "joined": team["robots_in_largest_component"],
-                "ate_m": team["ate_rmse_m"],
-                "psnr_db": own["psnr_db"],
-                "depth_l1_m": own["depth_l1_m"],
-            }
+    with ExitStack() as stack:
+        folder = plan.keep
+        if folder is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="duagc-bench-")))
+        for seconds in sorted(plan.seconds):
+            yield _row(plan, source, seconds, folder)
+
+
+def _row(plan: LengthPlan, source: Recording, seconds: float, folder: Path) -> dict[str, Any]:
+    """The figures of one run.
+
+    Args:
+        plan: what is run.
+        source: the whole recording.
+        seconds: of its logs.
+        folder: where the part of the recording and the run go.
+    """
+    path, out = folder / f"recording{seconds:g}", folder / f"run{seconds:g}"
+    if (path / RECORDING_FILE).is_file():
+        part = Recording(path)
+    else:
+        shutil.rmtree(path, ignore_errors=True)  # a part that was not finished
+        part = part_of(source, len(source.robots), seconds, path)
+    begun = out.exists() or out.with_name(f"{out.name}.part").exists()
+    done = execute(THIS, part.path, out, processors=plan.threads, options=plan.options)
+    front = [row for row in done.stages.values() if row["stage"] == "frontend"]
+    robots, team = list(done.metrics["robots"].values()), done.metrics["team"]
+    own = done.metrics["rendering"]["own"]["held_out"]
+    frames = sum(row["frames"] for row in robots)
+    return {
+        "seconds": seconds,
+        "frames": frames,
+        "keyframes": sum(row["keyframes"] for row in robots),
+        "cpu_s": round(sum(row["cpu_s"] for row in done.stages.values()) / len(robots), 3),
+        "frontend_cpu_s": round(sum(row["cpu_s"] for row in front) / len(front), 3),
+        "tracking_ms": round(1e3 * sum(row["parts"]["tracking_s"] for row in front) / frames, 3),
+        "wall_s": None if begun else round(done.wall_s, 3),
+        "frontend_peak_mb": max(row["peak_rss_mb"] for row in front),
+        "peak_memory_mb": max(row["peak_rss_mb"] for row in done.stages.values()),
+        "gaussians": sum(row["gaussians"] for row in robots),
+        "sent_mb": round(1e-6 * done.metrics["exchange"]["bytes_sent"], 3),
+        "joined": team["robots_in_largest_component"],
+        "ate_m": team["ate_rmse_m"],
+        "psnr_db": own["psnr_db"],
+        "depth_l1_m": own["depth_l1_m"],
+    }
 
 
 def format_table(result: dict[str, Any]) -> str:
@@ -98,8 +126,9 @@ def format_table(result: dict[str, Any]) -> str:
     Args:
         result: of `run`.
     """
-    head = ["s of log", "frames", "cpu s a robot", "more, s per s", "front end", "wall s"]
-    head += ["front end MB", "MB", "Gaussians", "joined", "team ATE mm", "PSNR dB", "depth L1 mm"]
+    head = ["s of log", "frames", "keyframes", "cpu s a robot", "more, s per s", "front end", "tracking ms"]
+    head += ["wall s", "front end MB", "MB", "Gaussians", "sent MB", "joined", "team ATE mm", "PSNR dB"]
+    head += ["depth L1 mm"]
     return "\n".join(
         markdown(
             head,
@@ -107,13 +136,16 @@ def format_table(result: dict[str, Any]) -> str:
                 [
                     f"{row['seconds']:g}",
                     row["frames"],
+                    row["keyframes"],
                     f"{row['cpu_s']:.1f}",
                     _digits(row.get("more_cpu_s_per_s"), 2),
                     f"{row['frontend_cpu_s']:.1f}",
-                    f"{row['wall_s']:.1f}",
+                    f"{row['tracking_ms']:.1f}",
+                    _digits(row["wall_s"], 1),
                     f"{row['frontend_peak_mb']:.0f}",
                     f"{row['peak_memory_mb']:.0f}",
                     row["gaussians"],
+                    f"{row['sent_mb']:.1f}",
                     row["joined"],
                     _digits(row["ate_m"], 2, 1e3),
                     _digits(row["psnr_db"], 2),

@@ -65,17 +65,22 @@ def bench_length(
     recording: Recorded,
     seconds: Annotated[str, typer.Option(help="Lengths of the logs, from their beginning.")],
     threads: Annotated[int, typer.Option(min=1, help="Processors that a run may use.")] = 2,
+    keep: Annotated[
+        Path | None,
+        typer.Option(help="Folder where the runs stay; what is there is not run again.", show_default=False),
+    ] = None,
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
     """Time, memory and accuracy of whole runs against the length of their logs.
 
-    Lengths are separated by commas. "more" is the processor time of every further second of log.
+    Lengths are separated by commas. "more" is the processor time of every further second of log. With `--keep`, a
+    bench that was stopped goes on where it was, and has no wall time of the runs that it found.
 
     Example: `duagc bench length recordings/redkitchen --seconds 2.5,5,10`
     """
     from duagc.pipeline.bench import length
 
     lengths = tuple(numbers("--seconds", seconds, 0.1, 1e6))
-    result = length.run(length.LengthPlan(recording, lengths, threads, tuple(_options(overrides))))
+    result = length.run(length.LengthPlan(recording, lengths, threads, tuple(_options(overrides)), keep))
     print(json.dumps(result, indent=2) if as_json else length.format_table(result))

@@ -21,7 +21,7 @@ recording, out, workers = sys.argv[2], sys.argv[4], int(sys.argv[6])
 robots = sorted(json.load(open(recording + "/recording.json"))["robots"])
 if "--fail" in sys.argv:
     sys.exit("duagc: no such thing")
-os.mkdir(out)
+os.makedirs(out, exist_ok=True)
 row = dict(wall_s=1.0, peak_rss_mb=100.0 * workers, executed=True)
 parts = dict(tracking_s=0.1, mapping_s=0.3, refinement_s=0.1, model_s=0.1, final_refinement_s=0.4)
 stages = {{f"frontend.{{r}}": row | dict(stage="frontend", robot=r, cpu_s={cost}, parts=parts) for r in robots}}
@@ -29,7 +29,9 @@ stages["exchange"] = row | dict(stage="exchange", robot=None, cpu_s=float(len(os
 json.dump(dict(stages=stages), open(out + "/timing.json", "w"))
 own = dict(held_out=dict(psnr_db=30.0, depth_l1_m=0.01))
 team = dict(robots_in_largest_component=len(robots), ate_rmse_m=None)
-metrics = dict(rendering=dict(own=own), team=team, robots={{r: dict(frames=5, gaussians=7) for r in robots}})
+robot = dict(frames=5, keyframes=2, gaussians=7)
+exchange = dict(bytes_sent=3_000_000)
+metrics = dict(rendering=dict(own=own), team=team, exchange=exchange, robots={{r: robot for r in robots}})
 json.dump(metrics, open(out + "/metrics.json", "w"))
 """
 
@@ -107,8 +109,22 @@ def test_length_says_what_a_further_second_costs(
     ]  # of a robot, its share of the exchange with it
     assert result["rows"][1]["more_cpu_s_per_s"] == 0.0
     assert " - |" in length.format_table(result).splitlines()[2]  # no ground truth, no ATE
+    assert [row["tracking_ms"] for row in result["rows"]] == [20.0, 20.0]
+    assert [row["sent_mb"] for row in result["rows"]] == [3.0, 3.0]
     with pytest.raises(DuagError, match=r"shortest log has 0\.3 s, expected 9 s or more"):
         length.run(length.LengthPlan(recording.path, (9.0,)))
+
+
+def test_what_is_kept_is_completed(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(length, "THIS", (str(command(tmp_path, 3.0)),))
+    plan = length.LengthPlan(recording.path, (0.1,), threads=1, keep=tmp_path / "kept")
+    (tmp_path / "kept" / "recording0.2").mkdir(parents=True)  # a part that was not finished
+    assert length.run(plan)["rows"][0]["wall_s"] > 0
+    plan = length.LengthPlan(recording.path, (0.1, 0.2), threads=1, keep=tmp_path / "kept")
+    assert [row["wall_s"] is None for row in length.run(plan)["rows"]] == [True, False]
+    assert sorted(path.name for path in (tmp_path / "kept").glob("run*")) == ["run0.1", "run0.2"]
 
 
 @pytest.mark.parametrize(
