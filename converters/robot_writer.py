@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.layouts.validity import EVERY, EVERY_NS, BlackBorder, mask_of_user
+from duagc.converters.layouts.validity import EVERY, EVERY_NS, MANY, BlackBorder, mask_of_user
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -166,7 +166,8 @@ class RobotWriter:
             calibration = messages.pack_calibration(stamp_ns, name, self.camera)
             self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
             self._write_valid(stamp_ns)
-        due = len(self._stamps) % EVERY == 0 or stamp_ns >= self._next_look_ns
+        index = len(self._stamps)
+        due = index % (EVERY if index >= MANY else EVERY // 2) == 0 or stamp_ns >= self._next_look_ns
         if self._black is not None and due:
             self._black.add(color)
             self._next_look_ns = stamp_ns + EVERY_NS

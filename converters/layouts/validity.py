@@ -22,15 +22,11 @@ from duagc.pipeline.geometry.masks import Mask
 
 ALL_ROBOTS = ""
 BLACK = 8  # of 255: a pixel that is never brighter sees nothing
-BRIGHT, BRIGHT_PERCENT = (
-    40,
-    75,
-)  # of 255: a percentile; an image with none above cannot tell black from a dark scene
+BRIGHT = 40  # of 255: an image whose percentile is no brighter cannot tell black pixels from a dark scene
+BRIGHT_PERCENT = 75
 LEAST_IMAGES = 8  # that must tell
-EVERY, EVERY_NS = (
-    8,
-    250_000_000,
-)  # an image of so many is looked at; where they are fewer, one in so long a time
+EVERY, EVERY_NS = 8, 250_000_000  # an image of so many is looked at, and one in so long a time
+MANY = 32  # images; of these twice as many are looked at, so that short recordings tell
 LEAST_BLACK = 0.002  # of the pixels, in pieces that touch the border
 GROW_PX = 4  # a vignette does not end from one pixel to the next
 ROUNDING_PX = 1e-4  # of maps that are float32; changes a gray value by less than 0.03
