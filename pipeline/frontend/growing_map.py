@@ -6,6 +6,8 @@ tile removes them for want of contribution, and the final optimization leaves th
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -153,14 +155,26 @@ class GrowingMap:
         huge = self.gaussians.log_scales.max(axis=1, initial=-np.inf) > np.log(config.max_scale_m)
         return self.keep((self.gaussians.opacity_logits >= logit) & ~huge | self.is_guest)
 
-    def keep_guests(self, gradients: Gradients) -> None:
-        """Let an optimization step leave the guests as they are.
+    def step_own(
+        self, gradients: Gradients, take: Callable[[Gaussians, Gradients, CompiledAdam], Gaussians]
+    ) -> None:
+        """Take an optimization step of all Gaussians but guests, in place.
 
         Args:
-            gradients: of a loss; those of guests become zero.
+            gradients: of a loss by all Gaussians.
+            take: gives the own ones after the step, from them, their gradients and the state of their optimizer.
         """
-        gradients.colors[: self.guests] = 0.0
-        gradients.opacity_logits[: self.guests] = 0.0
+        own = slice(self.guests, None)
+        first, second, steps, corrections = self.adam.state()
+        adam = CompiledAdam(threads=self.adam.threads)  # on the same memory
+        parts = (
+            {name: moments[own] for name, moments in moments_of.items()} for moments_of in (first, second)
+        )
+        adam.go_on((*parts, steps[own], corrections))
+        of_own = {name: getattr(gradients, name)[own] for name in first}
+        stepped = take(self.gaussians.select(own), replace(gradients, **of_own), adam)
+        for name in first:
+            getattr(self.gaussians, name)[own] = getattr(stepped, name)
 
     @property
     def is_guest(self) -> NDArray[np.bool_]:

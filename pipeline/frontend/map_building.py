@@ -94,6 +94,7 @@ class MapBuilder:
         save = self._checkpoints
         updates, state = save.done(f"{self.name}.mapping", self._grown)
         self._whole.go_on(state)
+        del state  # or it would be in memory twice
         unrefined = self._whole.gaussians
         clock.lap("mapping_s")
         supporting = supporting_frames(frames, keyframes, self.config, tiles=len(self._tiles))
@@ -102,6 +103,7 @@ class MapBuilder:
             f"{self.name}.final", lambda: self._finalized(supporting, log_s)
         )
         self._whole.go_on(state)
+        del state
         updates.append(self._update(keyframes[-1], stats, len(self._whole)))
         clock.lap("final_refinement_s")
         maps = Maps(self._whole.gaussians, unrefined, self._depth)
@@ -232,8 +234,8 @@ class MapBuilder:
             _, ((first, whole, self._poses, all_stats), *found) = saved
             self._whole.go_on(whole)
         for number, tile in enumerate(self._tiles[first:], first):
-            mapper = self._kept
-            if mapper is not None and len(self._tiles) == 1 and found is None:
+            mapper, self._kept = self._kept, None
+            if mapper is not None and found is None:
                 mapper.begin(take_tile(self._whole, tile, (), ()))  # its images are here
             else:
                 mapper = self._mapper(number, every, taken=found is None, supporting=of_tile[number])
@@ -251,19 +253,20 @@ class MapBuilder:
             for frame, T_map_camera in zip(of_tile[number], mapper.support_poses, strict=True):
                 self._poses[frame.frame_index] = T_map_camera
             self._whole.put_back(mapper.growing_map)
+            del mapper, save, others
         return self._summed(all_stats), self._poses, self._whole.state()
 
-    @staticmethod
-    def _summed(stats: Sequence[MappingStats]) -> MappingStats:
-        """Counts and mean losses of several tiles."""
+    def _summed(self, stats: Sequence[MappingStats]) -> MappingStats:
+        """Counts and mean losses of all tiles."""
         if len(stats) == 1:
             return stats[0]
+        weights = [len(tile) for tile in self._tiles]
         return MappingStats(
             inserted=sum(tile.inserted for tile in stats),
             pruned=sum(tile.pruned for tile in stats),
-            total=stats[-1].total,
-            loss_before=float(np.mean([tile.loss_before for tile in stats])),
-            loss_after=float(np.mean([tile.loss_after for tile in stats])),
+            total=len(self._whole),
+            loss_before=float(np.average([tile.loss_before for tile in stats], weights=weights)),
+            loss_after=float(np.average([tile.loss_after for tile in stats], weights=weights)),
         )
 
     def _left_out(self, steps: int, wanted: int, which: str, setting: str) -> None:

@@ -32,6 +32,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.kernels import (
+    CompiledAdam,
     Gradients,
     LossWeights,
     Rasterizer,
@@ -372,19 +373,29 @@ class Mapper:
             pose=pose_step is not None,
             closing=looked_at.closing,
         )
-        if keep_guests:
-            self._map.keep_guests(gradients)
-        self._map.gaussians = self._step.stepped(
-            self._map.gaussians,
-            gradients,
-            adam=self._map.adam,
-            rates=rates,
-            least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
-        )
+        least = np.float32(np.log(self.config.seeding.thickness_m))
+        take = partial(self._stepped, rates=rates, least_log_scales=least)
+        if keep_guests and self._map.guests:
+            self._map.step_own(gradients, take)
+        else:
+            self._map.gaussians = take(self._map.gaussians, gradients, self._map.adam)
         if pose_step is not None:
             assert gradients.pose is not None  # it was asked for
             view.T_map_camera = view.T_map_camera @ se3.exp(pose_step(gradients.pose))
         return loss.value
+
+    def _stepped(
+        self,
+        gaussians: Gaussians,
+        gradients: Gradients,
+        adam: CompiledAdam,
+        *,
+        rates: LearningRates,
+        least_log_scales: np.float32,
+    ) -> Gaussians:
+        return self._step.stepped(
+            gaussians, gradients, adam=adam, rates=rates, least_log_scales=least_log_scales
+        )
 
     # --- what is in the map -------------------------------------------------------------------------------------
 

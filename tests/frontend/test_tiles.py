@@ -10,6 +10,8 @@ from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping import Mapper
 from duagc.pipeline.frontend.tiles import Sight, border_keyframes, make_tiles, take_tile
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
+from duagc.pipeline.kernels.training import TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from tests.frontend.test_mapping import CAMERA, POSES, QUICK, drawn, same, shot
 
@@ -145,6 +147,30 @@ def test_tiles_are_drawn_as_well_as_one_map_with_the_same_bits_whatever_the_thre
     for T_map_camera in (POSES[0], between, POSES[3]):
         assert drawn(tiled, T_map_camera)[0] > drawn(one, T_map_camera)[0] - 1.0
     assert same(tiled.gaussians, _tiled(config, ([0, 1], [2, 3]), threads=3).gaussians)
+
+
+def test_a_step_of_the_own_gaussians_is_that_of_all_where_guests_have_no_gradient() -> None:
+    config, step, least = (
+        QUICK,
+        TrainingStep(Rasterizer(), LossWeights(0.1, 1.0, 0.02, 0.04), "blended"),
+        np.float32(-7.0),
+    )
+    maps = [take_tile(_grown(2), [1], _sights([1]), []) for _ in range(2)]
+    assert 0 < maps[0].guests < len(maps[0])
+    view = TrainingView(shot(POSES[1])[0].astype(np.float32) / 255, shot(POSES[1])[1], POSES[1])
+
+    def take(gaussians: Gaussians, gradients: Gradients, adam: CompiledAdam) -> Gaussians:
+        return step.stepped(gaussians, gradients, adam=adam, rates=config.rates, least_log_scales=least)
+
+    for _ in range(3):
+        _, gradients = step.gradients(maps[0].gaussians, CAMERA, view)
+        maps[0].step_own(gradients, take)
+        _, gradients = step.gradients(maps[1].gaussians, CAMERA, view)
+        for array in (gradients.colors, gradients.opacity_logits):
+            array[: maps[1].guests] = 0
+        maps[1].gaussians = take(maps[1].gaussians, gradients, maps[1].adam)
+    assert same(maps[0].gaussians, maps[1].gaussians)
+    assert not same(maps[0].gaussians, take_tile(_grown(2), [1], _sights([1]), []).gaussians)
 
 
 def test_guests_leave_room_for_what_a_tile_adds() -> None:
