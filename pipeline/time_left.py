@@ -180,7 +180,7 @@ def _guess(size: Size) -> int:
 
 
 def _evaluation(robot: str, size: Size, team: Sequence[str]) -> dict[str, float]:
-    """Parts of the evaluation of a robot by the names that are told: sets of views say whose they are."""
+    """Parts of the evaluation of a robot by the names that are reported: sets of views say whose they are."""
     parts = durations.evaluation_parts(size, len(team))
     peers = [name for name in team if name != robot]
     return {

@@ -1,4 +1,4 @@
-"""A gyroscope that turns otherwise than the images do is told."""
+"""A gyroscope that turns otherwise than the images do is reported."""
 
 from collections.abc import Callable
 
@@ -32,7 +32,7 @@ def moves(registered: int) -> list[Move]:
 
 
 @pytest.mark.parametrize(
-    ("of", "told"),
+    ("of", "reported"),
     [
         (lambda turn: turn, False),
         (lambda turn: np.add(turn, [0.01, 0.0, -0.01]), False),  # a bias
@@ -40,10 +40,10 @@ def moves(registered: int) -> list[Move]:
         (lambda turn: np.rad2deg(turn) % 3, True),
     ],
 )
-def test_mounting_and_unit_are_told(of: Callable[[np.ndarray], np.ndarray], told: bool) -> None:
+def test_mounting_and_unit_are_reported(of: Callable[[np.ndarray], np.ndarray], reported: bool) -> None:
     found = list(check_gyroscope("alpha", moves(PAIRS), Gyro(of)))
-    assert len(found) == told
-    assert not told or found[0].confidence > 0.95
+    assert len(found) == reported
+    assert not reported or found[0].confidence > 0.95
 
 
 def test_few_pairs_and_no_gyroscope_tell_nothing() -> None:

@@ -1,4 +1,4 @@
-"""Poses that do not belong to the depth are refused; rough ones are told."""
+"""Poses that do not belong to the depth are refused; rough ones are reported."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_right_poses_leave_nothing() -> None:
     assert "rough" not in rows
 
 
-def test_rough_poses_are_told_and_not_refused() -> None:
+def test_rough_poses_are_reported_and_not_refused() -> None:
     rows = checked(1.3).result("rec")  # 15 cm of 50, 5 % of the depth
     assert rows["reprojection_median_m"] == pytest.approx(0.15)
     assert rows["rough"]
