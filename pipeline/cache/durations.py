@@ -14,31 +14,31 @@ from duagc.pipeline.config.mapping import MappingConfig
 
 Size = Mapping[str, int]
 """`frames`, `pixels` of an image and `keyframes` of a robot; `moved`: 1 if depth is of other times than color."""
-TRACKING_S, POSES_S, MODEL_S = (0.004, 0.027), (0.006, 0.028), (0.001, 0.060)
+TRACKING_S, POSES_S, MODEL_S = (0.004, 0.030), (0.006, 0.022), (0.001, 0.057)
 """Of a frame: in any case, and for every million pixels."""
-MOVED_S = 0.17
+MOVED_S = 0.14
 """Of moving the depth of a frame, for every million pixels; a frame is read three times."""
-MAPPING_S = (0.006, 0.085)
+MAPPING_S = (0.0015, 0.086)
 """The same of a step of mapping, of which every keyframe takes some."""
-FINAL_S = (0.006, 0.085)
+FINAL_S = (0.0032, 0.087)
 """The same of a step of the final optimization."""
 START_S = 2.0
 """Of a process."""
 INFORMATION_S = 0.020
 """Of a frame, for every million pixels."""
-FUSION_S = 3.0
+FUSION_S = 2.0
 """Of a robot that has peers."""
-FUSED_VIEW_S = (0.20, 0.90)
+FUSED_VIEW_S = (0.12, 1.00)
 """Of a view that its fused map is trained on: in any case, and for every million pixels."""
-SCORED_S, COMPARED_S = (0.047, 0.09), (0.12, 0.50)
+SCORED_S, COMPARED_S = (0.027, 0.157), (0.02, 0.82)
 """The same of a render that is scored, and of a view that is compared with the others."""
 VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
 RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
 """Maps that are drawn at a held-out view, at a keyframe, and at a view of a peer."""
-EXCHANGE_S = (2.5, 9.0)
+EXCHANGE_S = (2.4, 10.0)
 """Of a robot that has peers: in any case, and for every million pixels."""
-READERS_S = 6.0
+READERS_S = 7.0
 """Report and view."""
 SERIAL = 0.15
 """Share of a stage of several threads that one thread does."""
