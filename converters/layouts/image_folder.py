@@ -27,6 +27,9 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.greatest_depth import unmeasured
+
+LOOKED_AT, LOOKED_AT_EVERY = 8, 8  # depth images, the first of a robot, and how far apart
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,13 @@ def write(
         recording.warnings += warnings
         for name, clip in zip(names or robot_names(len(clips)), clips, strict=True):
             sensors = {"part": clip.label, **clip.sensors}
+            greatest, share = _unmeasured(clip)
+            if greatest:
+                clip = replace(clip, no_depth=(*clip.no_depth, greatest))
+                recording.warnings.append(
+                    f"{name}: {share:.0%} of the depth is exactly {greatest * clip.depth_scale:.3f} m, far beyond all "
+                    "other: taken for none"
+                )
             with recording.robot(name, clip.camera, clip.depth_scale, sensors) as robot:
                 lens = _Lens(clip)
                 robot.set_valid(lens.valid)
@@ -158,6 +168,16 @@ def write(
             without = sum(frame.T_world_camera is None for frame in clip.frames)
             if without:
                 recording.warnings.append(f"{name}: {without} of {len(clip.frames)} frames have no true pose")
+
+
+def _unmeasured(clip: Clip) -> tuple[int, float]:
+    """The depth, in units, that a camera gives where it measures nothing, and its share; 0: it gives none."""
+    files = list(dict.fromkeys(frame.depth for frame in clip.frames if frame.depth is not None))
+    some = files[: LOOKED_AT_EVERY * LOOKED_AT : LOOKED_AT_EVERY]
+    size = clip.camera.width, clip.camera.height
+    images = [read_depth(path, size) for path in some]
+    greatest, share = unmeasured([np.where(np.isin(raw, clip.no_depth), 0, raw) for raw in images])
+    return int(greatest), share
 
 
 def _write_clip(robot: RobotWriter, clip: Clip, lens: _Lens, label: str) -> dict[str, Any]:

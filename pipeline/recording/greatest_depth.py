@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,23 @@ APART = 0.1
 """Relative step below the greatest depth from which no surface leads to it."""
 STEPS_APART = 10
 """Times the usual step between depths of a sensor that counts in coarse ones, likewise."""
+
+LEAST_SHARE = 0.005
+"""Of the known depth of each image that this distance has."""
+
+
+def unmeasured(images: Sequence[NDArray[Any]]) -> tuple[float, float]:
+    """The distance that a sensor gives where it measures nothing, and its share of the depth; zeros: it gives none.
+
+    Args:
+        images: depth of some images, 0 where it is unknown.
+    """
+    known = [image[image > 0] for image in images if (image > 0).any()]
+    greatest = greatest_apart(np.concatenate(known)) if known else 0.0
+    shares = [float(np.mean(depth == greatest)) for depth in known]
+    if not greatest or min(shares) < LEAST_SHARE:
+        return 0.0, 0.0
+    return greatest, float(np.mean(shares))
 
 
 def greatest_apart(depth: NDArray[Any]) -> float:

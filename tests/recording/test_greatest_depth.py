@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from duagc.pipeline.recording.greatest_depth import greatest_apart
+from duagc.pipeline.recording.greatest_depth import greatest_apart, unmeasured
 
 
 def test_the_greatest_distance_of_a_camera_stands_apart() -> None:
@@ -20,3 +20,14 @@ def test_surfaces_do_not_stand_apart() -> None:
     assert greatest_apart(np.repeat(steps, 40)) == 0.0
     assert greatest_apart(np.full(100, 2.0)) == 0.0
     assert greatest_apart(np.zeros(0)) == 0.0
+
+
+def test_every_image_must_have_it() -> None:
+    measured = np.linspace(800, 3100, 500).astype(np.uint16)
+    images = [
+        np.concatenate([measured + k, np.full(100, 8000, np.uint16), np.zeros(50, np.uint16)])
+        for k in range(4)
+    ]
+    assert unmeasured(images) == (8000.0, 1 / 6)
+    assert unmeasured([*images, measured]) == (0.0, 0.0)
+    assert unmeasured([]) == (0.0, 0.0)
