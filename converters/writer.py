@@ -158,7 +158,7 @@ class RecordingWriter:
         if not self._robots:
             raise DuagError(f"{self.out}: found no robot, expected at least one")
         for robot, row in self.checks.items():
-            if row.get("rough"):
+            if isinstance(row, Mapping) and row.get("rough"):
                 self.warnings.append(
                     f"{robot}: depth moved by its true poses differs by {row['reprojection_median_m']:.3f} m at "
                     f"{row['median_depth_m']:.2f} m (medians), far less than without a motion: poses or depth are rough"
