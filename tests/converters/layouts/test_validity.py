@@ -82,7 +82,7 @@ def test_bars_that_leave_little_of_an_image_are_found() -> None:
 
 
 def test_a_camera_of_few_images_a_second_is_looked_at_as_often(tmp_path: Path) -> None:
-    """At 4 Hz every image counts, at 40 Hz every tenth: 12 images are enough, or too few."""
+    """At 4 Hz every image shows, at 40 Hz every tenth: 12 images are enough, or too few."""
     color = np.full((48, 64, 3), 120, np.uint8)
     color[:10] = 0
     data = cv2.imencode(".png", color)[1].tobytes()
