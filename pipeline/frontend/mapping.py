@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -22,12 +21,12 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
-from duagc.pipeline.frontend.contributions import contributions
 from duagc.pipeline.frontend.growing_map import GrowingMap
+from duagc.pipeline.frontend.map_content import MapContent
 from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
 from duagc.pipeline.frontend.view_poses import PoseStep, PoseSteps
-from duagc.pipeline.frontend.view_selection import covisible, optimization_window
+from duagc.pipeline.frontend.view_selection import optimization_window
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
@@ -35,15 +34,12 @@ from duagc.pipeline.kernels import (
     CompiledAdam,
     Gradients,
     LossWeights,
-    Rasterizer,
-    Render,
     ViewLoss,
 )
 from duagc.pipeline.kernels.sparse_steps import EVERYTHING, LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import TrainingStep
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import smoothstep_decay
-from duagc.pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
 MANY_VIEWS = 16
 """Views from which on every second one reports what a Gaussian contributes to all."""
@@ -68,7 +64,7 @@ class MappingStats:
     loss_after: float
 
 
-class Mapper:
+class Mapper(MapContent):
     """Grow and optimize the Gaussian map of one robot."""
 
     def __init__(
@@ -95,65 +91,17 @@ class Mapper:
             begun: the Gaussians of a tile of the map; None: an empty map.
             tile: its number.
         """
-        self.config, self.seed, self._tile = config, seed, tile
-        self.cameras = (camera, camera.halved())
+        depth = config.depth_kind(depth_noise_m)
+        super().__init__(camera, config, depth=depth, threads=threads, begun=begun)
+        self.seed, self._tile = seed, tile
         self.budget = MappingBudget(config, camera)
-        self.rasterizer = Rasterizer(threads=threads)
-        self.depth = config.depth_kind(depth_noise_m)
         self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())
         self._step = TrainingStep(self.rasterizer, self._loss_weights, self.depth)
-        self._map = GrowingMap(config, threads=threads) if begun is None else begun
-        self._views: list[View] = []
-        self._support: list[View] = []
-        self._borders: list[View] = []
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """The map so far, in the map frame."""
-        return self._map.gaussians
-
-    @property
-    def growing_map(self) -> GrowingMap:
-        """The Gaussians with all that is known of them."""
-        return self._map
 
     @property
     def exact_depth(self) -> bool:
         """Whether the map has the depth kind of exact depth images."""
         return self.depth == "ray_plane"
-
-    @property
-    def keyframe_poses(self) -> NDArray[np.float64]:
-        """Poses [k, 4, 4] of the keyframes; `finalize` refines them."""
-        return np.array([view.T_map_camera for view in self._views]).reshape(-1, 4, 4)
-
-    @property
-    def support_poses(self) -> NDArray[np.float64]:
-        """Poses [m, 4, 4] of the supporting frames, in the order in which they were added; `finalize` refines them."""
-        return np.array([view.T_map_camera for view in self._support]).reshape(-1, 4, 4)
-
-    def state(self) -> tuple[Any, ...]:
-        """The map and the poses of the views; `go_on` takes it."""
-        return self._map.state(), [view.T_map_camera for view in (*self._views, *self._support)]
-
-    def go_on(self, state: tuple[Any, ...]) -> None:
-        """Go on from where another one was.
-
-        Args:
-            state: of that one, which had the views that are here now.
-        """
-        of_map, poses = state
-        self._map.go_on(of_map)
-        for view, T_map_camera in zip((*self._views, *self._support), poses, strict=True):
-            view.T_map_camera = T_map_camera
-
-    def begin(self, begun: GrowingMap) -> None:
-        """Begin with other Gaussians, and the same views.
-
-        Args:
-            begun: the Gaussians of the tile.
-        """
-        self._map = begun
 
     def put_back(self, *view: Any, **more: Any) -> None:
         """Take in a keyframe of which a state follows, and do nothing for it.
@@ -342,10 +290,6 @@ class Mapper:
 
     # --- one view -----------------------------------------------------------------------------------------------
 
-    def _draw(self, view: View) -> Render:
-        T_camera_map = se3.inverse(view.T_map_camera)
-        return self.rasterizer.forward(self.gaussians, self.cameras[0], T_camera_map, depth_kind=self.depth)
-
     def _loss(self, view: View, level: int) -> float:
         return self._view_gradients(view, level)[0].value
 
@@ -395,104 +339,4 @@ class Mapper:
     ) -> Gaussians:
         return self._step.stepped(
             gaussians, gradients, adam=adam, rates=rates, least_log_scales=least_log_scales
-        )
-
-    # --- what is in the map -------------------------------------------------------------------------------------
-
-    def _seed(self, view: View, share: float) -> tuple[int, int]:
-        """Insert discs for what the map does not explain of a view; numbers of inserted and pruned Gaussians."""
-        config = self.config
-        budget = int(share * config.max_gaussians)
-        color, depth_m = view.images(0)
-        wanted = depth_m > 0  # zero where the mask forbids a pixel
-        if len(self._map):
-            render = self._draw(view)
-            color = self._as_drawn(view, color, render)
-            wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=view.depth_sigma_m)
-        new = self._discs(view, color, depth_m, wanted, budget=budget)
-        excess = len(self._map) + len(new) - self._map.cap
-        views = [*self._borders, *self._views]
-        swept = covisible(
-            views, view, config.sweep_keyframes, candidates=config.candidates, camera=self.cameras[0]
-        )
-        self._map.update_contributions(*self._contributions(swept))
-        pruned = self._map.prune_least(excess) if excess > 0 else 0
-        self._map.append(new)
-        return len(new), pruned
-
-    def _as_drawn(self, view: View, color: Image, render: Render) -> Image:
-        """The view's colors; where the mask forbids a pixel, those of the render."""
-        # errors are smoothed: a masked pixel must not count through its neighbors
-        return color if view.mask is None else np.where(view.mask[..., None], color, render.color)
-
-    def _discs(
-        self, view: View, color: Image, depth_m: Image, wanted: NDArray[np.bool_], *, budget: int
-    ) -> Gaussians:
-        return seed_discs(
-            color,
-            depth_m,
-            wanted,
-            self.cameras[0],
-            T_map_camera=view.T_map_camera,
-            budget=budget,
-            first_id=self._map.next_id,
-            anchor=view.index,
-            config=self.config.seeding,
-        )
-
-    def _cover(self) -> tuple[int, int]:
-        """Insert discs where supporting views see what no keyframe saw; numbers of inserted and pruned Gaussians."""
-        config = self.config
-        if not config.support_seeds or not self._support:
-            return 0, 0
-        inserted = 0
-        for view in self._support:
-            render = self._draw(view)
-            color, depth_m = view.images(0)
-            thin = (depth_m > 0) & (render.alpha < config.seeding.min_alpha)
-            new = self._discs(
-                view, color, depth_m, thin, budget=int(config.keyframe_share * config.max_gaussians)
-            )
-            self._map.append(new)
-            inserted += len(new)
-        excess = len(self._map) - self._map.cap
-        if excess <= 0:
-            return inserted, 0
-        views = [*self._views, *self._support, *self._borders]
-        self._map.contribution = self._contributions(views)[0]
-        return inserted, self._map.prune_least(excess)
-
-    def _prune_useless(self, looked_at: Sequence[View], views: int) -> int:
-        """Remove what contributes nothing to the views that are looked at, of so many; how many there were.
-
-        What none of some views sees stays, and guests do.
-        """
-        found, seen = self._contributions(looked_at)
-        least = self.config.min_contribution * len(looked_at) / views
-        return self._map.keep((found >= least) | (~seen & (len(looked_at) < views)) | self._map.is_guest)
-
-    def _densify(self, share: float) -> int:
-        """Insert discs where keyframes are drawn worst; how many.
-
-        `share` of the room below the cap is used. Every keyframe gets an equal part of it, in turn, and sees what
-        those before it inserted; no more than an eighth of its finest cells is seeded.
-        """
-        room = int(share * self._map.room)
-        inserted = 0
-        for k, view in enumerate(self._views):
-            budget = room * (k + 1) // len(self._views) - room * k // len(self._views)
-            render = self._draw(view)
-            color, depth_m = view.images(0)
-            color = self._as_drawn(view, color, render)
-            budget = min(budget, depth_m.size // (8 * self.config.seeding.cell_sizes_px[-1] ** 2))
-            wanted = worst_drawn(render, color, depth_m, count=budget, config=self.config.seeding)
-            new = self._discs(view, color, depth_m, wanted, budget=budget)
-            self._map.append(new)
-            inserted += len(new)
-        return inserted
-
-    def _contributions(self, views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """What these views would lack of each Gaussian; and if any saw it (`contributions`)."""
-        return contributions(
-            self.gaussians, views, self.rasterizer, self.config, camera=self.cameras[1], depth=self.depth
         )
