@@ -44,6 +44,7 @@ OPTIONAL = {
         "exchange.transport.signatures = 'ed25519'",
         "pip install 'duagc[signed]'",
     ),
+    "small_gicp": ("small_gicp", "exchange.verification.method = 'gicp'", "pip install 'duagc[gicp]'"),
     "submitit": ("submitit", "`duagc batch --engine slurm`", "pip install 'duagc[slurm]'"),
     "ray": ("ray", "`duagc batch --engine ray`", "pip install 'duagc[ray]'"),
     "pytest": ("pytest", "the tests", "pip install 'duagc[test]'"),

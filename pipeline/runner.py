@@ -16,6 +16,7 @@ from pathlib import Path
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.config.packages import check_packages
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.existing_run import is_up_to_date
 from duagc.pipeline.job import Job
@@ -63,6 +64,7 @@ def run(
     Raises:
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
+    check_packages(config)
     plan = RunPlan(
         workers, force, calibrate, store=store, since=since, until=until, evaluated=evaluated, follow=follow
     )

@@ -77,7 +77,7 @@ def run(
     """
     from duagc.pipeline.batch.engines import engine_of
     from duagc.pipeline.cache.store import default_store
-    from duagc.pipeline.experiments.carry_out import carry_out, check_place, check_recordings
+    from duagc.pipeline.experiments.carry_out import carry_out, check_packages, check_place, check_recordings
     from duagc.pipeline.experiments.pages import PAGE, judge_folder, write_report
     from duagc.pipeline.experiments.rule import experiment_names, read_experiment
 
@@ -89,6 +89,7 @@ def run(
     recordings = dict(_named_folder(text) for text in recording or ())
     for experiment in chosen:
         experiment.profile(profile)
+        check_packages(experiment, profile)
         check_place(experiment, profile, out)
     check_recordings(chosen, recordings)
     failed = []

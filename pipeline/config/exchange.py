@@ -7,7 +7,7 @@ from pydantic import Field
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig, WeightKind
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
-from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
+from duagc.pipeline.config.registration import GeometricVerificationConfig, GicpConfig, RegistrationConfig
 
 EvidenceOrder = Literal["gain", "paper", "random", "reversed"]
 
@@ -47,6 +47,11 @@ class PeerRegistrationConfig(RegistrationConfig):
 class VerificationConfig(GeometricVerificationConfig):
     """From a candidate to a loop closure with another robot: RANSAC over 3-D matches, then registration."""
 
+    method: Literal["features", "features_gicp", "gicp"] = "features"
+    """How the motion is found. features: as above; to compare with, with GICP in the place of our registration
+    (features_gicp), or GICP alone, which begins as if both cameras stood at one place (extra `gicp`)."""
+    gicp: GicpConfig = GicpConfig()
+    """Settings of GICP."""
     hypotheses: int = Field(default=500, ge=1)
     """Three-point samples of RANSAC."""
     samples: int = Field(default=2000, ge=50)
@@ -79,10 +84,11 @@ class ExchangeConfig(Config):
     """Length of one round."""
     max_rounds: int = Field(default=3000, ge=1)
     """The session ends here, whatever has been agreed."""
-    solver: Literal["admm", "elimination", "algorithm_1", "algorithm_1_printed"] = "admm"
+    solver: Literal["admm", "elimination", "elected", "algorithm_1", "algorithm_1_printed"] = "admm"
     """Of the poses. admm: relaxed edge-ADMM, a few poses per round and link; elimination: exact steps along a tree of
-    robots, matrices in few rounds; to compare with, Algorithm 1 of the paper, by which matched Gaussians move poses:
-    with the corrections that it needs, or as printed."""
+    robots, matrices in few rounds; to compare with, one elected robot that gets all graphs and solves for all, and
+    Algorithm 1 of the paper, by which matched Gaussians move poses: with the corrections that it needs, or as
+    printed."""
     algorithm_1_penalty: float = Field(default=0.01, gt=0.0)
     """rho of Algorithm 1 as printed, as a multiple of the loop closures' information; larger ones diverge sooner."""
     elimination_wire: Literal["float32", "float64"] = "float64"

@@ -92,6 +92,17 @@ class GeometricVerificationConfig(Config):
     """The same for the rotation."""
 
 
+class GicpConfig(Config):
+    """Registration of points by generalized ICP, to compare with."""
+
+    voxel_m: float = Field(default=0.03, gt=0.0)
+    """Edge of the voxels that either view's points are thinned to."""
+    distances_m: tuple[float, ...] = Field(default=(1.0, 0.3, 0.1), min_length=1)
+    """Distances below which points correspond, one run each."""
+    iterations: int = Field(default=30, ge=1)
+    """Most steps of each run."""
+
+
 class MovingConfig(Config):
     """Finding moving objects by depth alone."""
 

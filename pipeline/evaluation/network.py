@@ -28,6 +28,7 @@ Series = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 SOLVERS = {
     "admm": "relaxed edge-ADMM (poses), evidence sent once (Gaussians)",
     "elimination": "elimination along a tree of robots (poses), evidence sent once (Gaussians)",
+    "elected": "an elected robot with all graphs (poses), evidence sent once (Gaussians)",
     "algorithm_1": "Algorithm 1 of the paper, corrected: matched Gaussians move poses",
     "algorithm_1_printed": "Algorithm 1 of the paper, as printed: poses and matched Gaussians move together",
 }

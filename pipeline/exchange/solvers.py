@@ -353,6 +353,10 @@ def solver_of(config: ExchangeConfig, team: int) -> SolverFactory:
     def make(start: SolverStart) -> PoseSolver:
         if config.solver == "admm":
             return AdmmSolver(start, config.consensus)
+        if config.solver == "elected":
+            from duagc.pipeline.exchange.elected import ElectedSolver  # which needs this module
+
+            return ElectedSolver(start, config.consensus, team)
         if config.solver != "elimination":
             from duagc.pipeline.exchange.algorithm_1 import Algorithm1Solver  # which needs this module
 

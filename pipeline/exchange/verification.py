@@ -1,4 +1,7 @@
-"""From a candidate pair of keyframes to a loop closure: `registration.geometric_verification`, and its verdict."""
+"""From a candidate pair of keyframes to a loop closure: `registration.geometric_verification`, and its verdict.
+
+To compare with, generalized ICP of the two views' points in its place, from the motion of the features or without any.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,17 @@ import numpy as np
 from duagc.pipeline.config.exchange import VerificationConfig
 from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 from duagc.pipeline.registration import RgbdPyramid, geometric_verification
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.geometric_verification import (
     Failure,
+    FeatureMotion,
     GeometricVerification,
     VerificationView,
 )
+from duagc.pipeline.registration.gicp import register_points
 
 
 class Verdict(Enum):
@@ -79,6 +85,8 @@ def verify(
     Returns:
         The verdict, and the loop closure T_own_peer with its information if the verdict is KEPT.
     """
+    if config.method != "features":
+        return _verified_by_gicp(candidate, own, own_pyramid, sample, config=config, rng=rng)
     found = geometric_verification.verify(
         VerificationView(own, images=lambda: own_pyramid),
         VerificationView(sample.features, sample.reference),
@@ -93,6 +101,43 @@ def verify(
             candidate.own_keyframe, candidate.peer_keyframe, found.T_first_second, found.information
         )
     return Verified(verdict, found.features.matches, found.features.inliers, detail, closure)
+
+
+def _verified_by_gicp(
+    candidate: Candidate,
+    own: Features,
+    own_pyramid: RgbdPyramid,
+    sample: KeyframeSample,
+    *,
+    config: VerificationConfig,
+    rng: np.random.Generator,
+) -> Verified:
+    """As `verify`, by the points alone once there is a motion to begin with."""
+    seen = own_pyramid.levels[0].points
+    theirs = sample.reference.levels[0].points.astype(np.float64)
+    if config.method == "gicp":
+        found = FeatureMotion(np.eye(4), len(theirs), 0, 0)
+    else:
+        found = geometric_verification.motion_from_features(own, sample.features, config, rng)
+    if found.T_first_second is None:
+        return Verified(Verdict.FEW_MATCHES, found.matches, 0, f"{found.needed} needed")
+    if not found.accepted:
+        return Verified(Verdict.FEW_INLIERS, found.matches, found.inliers, f"{found.needed} needed")
+    result = register_points(seen, theirs, found.T_first_second, config.gicp)
+    if result is None or result.overlap < config.min_overlap:
+        share = 0.0 if result is None else result.overlap
+        return Verified(Verdict.NOT_REGISTERED, found.matches, found.inliers, f"GICP: overlap {share:.2f}")
+    moved_m, moved_rad = (float(d) for d in se3.distance(found.T_first_second, result.T_target_source))
+    detail = f"refined by {moved_m:.4f} m, {moved_rad:.4f} rad"
+    if config.method != "gicp" and (
+        moved_m > config.max_refinement_m or moved_rad > config.max_refinement_rad
+    ):
+        return Verified(Verdict.MOVED, found.matches, found.inliers, detail)
+    closure = LoopClosure(
+        candidate.own_keyframe, candidate.peer_keyframe, result.T_target_source, result.information
+    )
+    inliers = result.inliers if config.method == "gicp" else found.inliers
+    return Verified(Verdict.KEPT, found.matches, inliers, detail, closure)
 
 
 _VERDICTS = {

@@ -20,6 +20,9 @@ from duagc.pipeline.batch.cell import read_state, run_folder
 from duagc.pipeline.batch.engines import Engine
 from duagc.pipeline.batch.results import gather
 from duagc.pipeline.batch.suite import BatchCell, Suite, read_suite
+from duagc.pipeline.config import packages
+from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.experiments.metric_names import names_in, needs_truth
 from duagc.pipeline.experiments.rule import Experiment, Profile, SimulatedData, config_of
@@ -53,6 +56,25 @@ def check_recordings(experiments: Sequence[Experiment], recordings: Mapping[str,
                     f"{folder}: has no ground truth of {without[0]}, "
                     f"expected it for metric {needed} of {experiment.name}"
                 )
+
+
+def check_packages(experiment: Experiment, profile: str) -> None:
+    """Refuse an experiment one of whose configurations needs a package that is not installed.
+
+    Args:
+        experiment: that will be run.
+        profile: its name.
+
+    Raises:
+        DuagError: names the package and what installs it.
+    """
+    chosen = experiment.profile(profile)
+    for configuration in experiment.file.configurations:
+        settings = config_of(experiment.file, chosen, configuration)
+        try:
+            packages.check_packages(load_config(RunConfig, None, settings))
+        except DuagError as error:
+            raise DuagError(f"{experiment.path}: configuration {configuration}: {error}") from error
 
 
 def check_place(experiment: Experiment, profile: str, out: Path) -> None:
