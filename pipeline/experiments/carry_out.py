@@ -25,12 +25,13 @@ from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.experiments.metric_names import names_in, needs_truth
-from duagc.pipeline.experiments.rule import Experiment, Profile, SimulatedData, config_of
+from duagc.pipeline.experiments.rule import Experiment, Profile, SimulatedData, config_of, data_of
 from duagc.pipeline.experiments.statistics import mean
 from duagc.pipeline.experiments.verdicts import ResultRow
 from duagc.pipeline.recording import Recording
 
 RESULT, SUITE, RECORDINGS = "result.json", "suite.toml", "recordings"
+SIMULATED = "seed_"  # in front of the names of simulated recordings
 UNTIL = "evaluation"
 
 
@@ -45,7 +46,7 @@ def check_recordings(experiments: Sequence[Experiment], recordings: Mapping[str,
         DuagError: names the recording, what it lacks and what needs it.
     """
     for name, folder in recordings.items():
-        if not re.fullmatch(r"(?!seed_)[A-Za-z0-9_.]+", name):
+        if not re.fullmatch(rf"(?!{SIMULATED})[A-Za-z0-9_.]+", name):
             raise DuagError(f"--recording {name}: expected letters, digits, _ and ., and no seed_ in front")
         recording = Recording(folder)
         without = [robot for robot in recording.robots if recording.groundtruth(robot) is None]
@@ -167,41 +168,54 @@ def prepare(
     Raises:
         DuagError: a recording cannot be read.
     """
-    folders = dict[str, Path]()
-    for seed in profile.seeds:
-        folder = recording_folder(out, profile.data, seed)
-        folders[_simulated_name(seed)] = folder
-        if not folder.exists():
-            log(f"simulate: {profile.data.robots} robots, {profile.data.frames} frames each, seed {seed}")
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            settings = {k: v for k, v in profile.data.model_dump().items() if k not in ("width", "height")}
-            size = (profile.data.width, profile.data.height)
-            simulate(folder, size=size, seed=seed, **settings)
+    folders, own = dict[str, Path](), dict[str, tuple[int, SimulatedData]]()
+    for data in dict.fromkeys(
+        data_of(experiment.file, profile, name) for name in experiment.file.configurations
+    ):
+        for seed in profile.seeds:
+            folder = recording_folder(out, data, seed)
+            name = f"{SIMULATED}{seed}" + ("" if data == profile.data else f".{folder.name.split('-')[0]}")
+            folders[name], own[name] = folder, (seed, data)
+            if not folder.exists():
+                log(f"simulate: {data.robots} robots, {data.frames} frames each, seed {seed}")
+                folder.parent.mkdir(parents=True, exist_ok=True)
+                settings = {k: v for k, v in data.model_dump().items() if k not in ("width", "height")}
+                simulate(folder, size=(data.width, data.height), seed=seed, **settings)
     for name, folder in recordings.items():
         folders[name] = folder.resolve()
     path = out / experiment.name / SUITE
     path.parent.mkdir(parents=True, exist_ok=True)
     with new_file(path) as part:
-        part.write_text(_suite_text(experiment, profile, folders, path.parent), encoding="utf-8")
+        part.write_text(_suite_text(experiment, profile, folders, path.parent, own=own), encoding="utf-8")
     return read_suite(path)
 
 
-def _simulated_name(seed: int) -> str:
-    return f"seed_{seed}"
-
-
-def _suite_text(experiment: Experiment, profile: Profile, folders: Mapping[str, Path], base: Path) -> str:
-    """Every simulated recording with the run's seed that is its own; real ones with the first seed."""
+def _suite_text(
+    experiment: Experiment,
+    profile: Profile,
+    folders: Mapping[str, Path],
+    base: Path,
+    *,
+    own: Mapping[str, tuple[int, SimulatedData]],
+) -> str:
+    """Every simulated recording with its own seed and the configurations that it is for; real ones with the first."""
     lines = [f"seeds = {list(profile.seeds)}", f'until = "{UNTIL}"', "[recordings]"]
-    lines += [f"{name} = {json.dumps(os.path.relpath(folder, base))}" for name, folder in folders.items()]
+    lines += [
+        f"{json.dumps(name)} = {json.dumps(os.path.relpath(path, base))}" for name, path in folders.items()
+    ]
     for name in experiment.file.configurations:
         settings = config_of(experiment.file, profile, name)
         lines += [f"[configurations.{name}]", f"set = {json.dumps(settings)}"]
-    own = {_simulated_name(seed): seed for seed in profile.seeds}
     for name in folders:
-        for seed in profile.seeds:
-            if seed != own.get(name, profile.seeds[0]):
-                lines += ["[[exclude]]", f'recording = "{name}"', f"seed = {seed}"]
+        only, data = own.get(name, (profile.seeds[0], profile.data))
+        left_out = [f"seed = {seed}" for seed in profile.seeds if seed != only]
+        left_out += [
+            f"configuration = {json.dumps(other)}"
+            for other in experiment.file.configurations
+            if data_of(experiment.file, profile, other) != data
+        ]
+        for row in left_out:
+            lines += ["[[exclude]]", f"recording = {json.dumps(name)}", row]
     return "\n".join(lines) + "\n"
 
 
@@ -261,7 +275,7 @@ def _row(experiment: Experiment, cell: BatchCell, folder: Path, numbers: Mapping
         values[metric] = mean(known) if known and len(known) == len(found) else None
         if values[metric] is None:
             reasons[metric] = failure or _reason(run_folder(folder, cell.name), metric)
-    recording = "" if cell.recording == _simulated_name(cell.seed) else cell.recording
+    recording = "" if cell.recording.startswith(SIMULATED) else cell.recording
     return ResultRow(recording, cell.configuration, cell.seed, values, reasons)
 
 

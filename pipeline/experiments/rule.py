@@ -69,10 +69,12 @@ class Profile(Config):
 
 
 class RuleConfiguration(Config):
-    """Settings of some runs."""
+    """Settings of some runs, and what is different in what is simulated for them."""
 
     set: tuple[str, ...] = ()
     """`a.b=value`."""
+    data: dict[str, int | float | str] = Field(default_factory=dict)
+    """Of the data of the profile, what these runs have different; they are run on no other recording."""
 
 
 class Metric(Config):
@@ -215,6 +217,18 @@ def config_of(experiment: ExperimentFile, profile: Profile, configuration: str) 
     return [*profile.set, *experiment.configurations[configuration].set]
 
 
+def data_of(experiment: ExperimentFile, profile: Profile, configuration: str) -> SimulatedData:
+    """What is simulated for a configuration.
+
+    Args:
+        experiment: that has it.
+        profile: how much is computed.
+        configuration: its name.
+    """
+    changed = experiment.configurations[configuration].data
+    return SimulatedData.model_validate(profile.data.model_dump() | changed)
+
+
 def _complaint(error: ValidationError) -> str:
     first = error.errors()[0]
     return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
@@ -231,9 +245,15 @@ def _check(path: Path, file: ExperimentFile) -> None:
         where = f"{path}: profile {name}"
         if not profile.seeds:
             raise DuagError(f"{where}: found no seed, expected at least one")
-        for seed in profile.seeds:
-            profile.data.settings(seed).check()
         for configuration in file.configurations:
+            try:
+                data = data_of(file, profile, configuration)
+                for seed in profile.seeds:
+                    data.settings(seed).check()
+            except ValidationError as error:
+                raise DuagError(
+                    f"{where}: configuration {configuration}: data: {_complaint(error)}"
+                ) from error
             try:
                 load_config(RunConfig, None, config_of(file, profile, configuration))
             except DuagError as error:

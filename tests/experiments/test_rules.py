@@ -1,13 +1,16 @@
 """Experiments are read whole before anything runs; what they name exists."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.batch.suite import SuiteFile
+from duagc.pipeline.experiments.carry_out import prepare
 from duagc.pipeline.experiments.metric_names import KNOWN, names_in, needs_truth
-from duagc.pipeline.experiments.rule import RULES, experiment_names, read_experiment
+from duagc.pipeline.experiments.rule import RULES, data_of, experiment_names, read_experiment
 from tests.fixtures import fake_run
 from tests.fixtures.commands import assert_one_line, duagc_here
 from tests.layers import ROOT
@@ -165,3 +168,53 @@ def test_a_recording_without_truth_is_refused_before_anything_runs(tmp_path: Pat
     ):
         assert_one_line(duagc_here("experiment", "run", "h1_team", "--recording", text, "--out", out), said)
     assert not out.exists()
+
+
+def test_a_configuration_may_have_data_of_its_own(folder: Path) -> None:
+    text = FILE.replace(
+        "[configurations.lossy]", "[configurations.lossy]\ndata = { overlap = 0.2, robots = 3 }"
+    )
+    (folder / "mine.toml").write_text(text)
+    found = read_experiment("mine", folder)
+    profile = found.profile("small")
+    data = {name: data_of(found.file, profile, name) for name in found.file.configurations}
+    assert (data["plain"].robots, data["plain"].overlap) == (2, profile.data.overlap)
+    assert (data["lossy"].robots, data["lossy"].overlap, data["lossy"].frames) == (3, 0.2, 2)
+    for wrong, said in (("robots = 99", "robots is 99"), ("robts = 3", "data: robts")):
+        (folder / "mine.toml").write_text(text.replace("robots = 3", wrong))
+        with pytest.raises(DuagError, match=said):
+            read_experiment("mine", folder)
+
+
+def test_every_configuration_runs_on_its_own_data_alone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulated = []
+
+    def simulate(path: Path, **settings: object) -> None:
+        simulated.append((settings["seed"], settings["overlap"]))
+        path.mkdir(parents=True)
+
+    monkeypatch.setattr("duagc.pipeline.experiments.carry_out.simulate", simulate)
+    monkeypatch.setattr("duagc.pipeline.experiments.carry_out.read_suite", lambda path: path)
+    text = FILE.replace("[configurations.lossy]", "[configurations.lossy]\ndata = { overlap = 0.2 }")
+    (folder / "mine.toml").write_text(text.replace("[0, 1, 2, 3, 4]", "[3, 4]"))
+    found = read_experiment("mine", folder)
+    path = prepare(found, found.profile("small"), folder / "out", recordings={}, log=lambda _: None)
+    assert simulated == [(3, 0.6), (4, 0.6), (3, 0.2), (4, 0.2)]
+    suite = SuiteFile.model_validate(tomllib.loads(Path(str(path)).read_text()))
+    left = {
+        (recording, configuration, seed)
+        for recording in suite.recordings
+        for configuration in suite.configurations
+        for seed in suite.seeds
+        if not any(
+            row.recording == recording and (row.configuration == configuration or row.seed == seed)
+            for row in suite.exclude
+        )
+    }
+    plain = [("seed_3", "plain", 3), ("seed_4", "plain", 4)]
+    assert sorted(cell for cell in left if cell[1] == "plain") == plain
+    lossy = sorted(cell for cell in left if cell[1] == "lossy")
+    assert [(name.split(".")[0], seed) for name, _, seed in lossy] == [("seed_3", 3), ("seed_4", 4)]
+    assert not {name for name, _, _ in lossy} & {name for name, _, _ in plain}
