@@ -87,9 +87,16 @@ class FusionConfig(Config):
     explained_opacity: float = Field(default=0.9, ge=0.0, le=1.0)
     """A keyframe explains only where the own map is at least this opaque; where depth is missing, the rendered one is
     used."""
+    final_start: Literal["finest", "drawn"] = "finest"
+    """What the final map begins with. finest: the fused map, with peers' Gaussians by `finer`; drawn: of the fused map
+    and all that peers' maps have beyond it, as many Gaussians as the fused map has, those that draw most of the views
+    that are trained on."""
+    most_final: int | None = Field(default=None, ge=1)
+    """Most Gaussians that a start by `drawn` has; None: as many as the fused map."""
     finer: float | None = Field(default=1.3, ge=1.0)
     """In the final map a peer's Gaussians replace own ones where the peer's keyframes saw the surface at so many times
-    the resolution of own ones; None: never. With coverage = overlap, or max_added, nothing is replaced."""
+    the resolution of own ones; None: never. With coverage = overlap, or max_added, nothing is replaced or begun by
+    `drawn`."""
     own_pixel_steps: int = Field(default=3, ge=0)
     """Gauss-Newton steps on the opacities of imported Gaussians, by the robot's own images; 0: their owners' values."""
     added_need_information: bool = True

@@ -21,6 +21,7 @@ from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.finest_views import from_finest_views
 from duagc.pipeline.fusion.finetune import finetune_map
 from duagc.pipeline.fusion.fuse import FusedMap, OwnMap, fuse
+from duagc.pipeline.fusion.most_drawn import most_drawn
 from duagc.pipeline.fusion.opacity_update import update_opacities
 from duagc.pipeline.fusion.peer_validation import PeerCheck, ValidatedPeers, validate_peer_maps
 from duagc.pipeline.fusion.peer_views import peer_views
@@ -203,15 +204,17 @@ def _finetuned(
     if config.peer_share:
         usable = {name: e.select(~valid.contradicted[name]) for name, e in valid.evidence.items()}
         shown = peer_views(usable, poses, context, depth_kinds=result.depth_of, colors=fused.colors)
-        factor = context.config.finer
-        if factor is not None and context.config.imports_all:
+        if context.config.final_start == "drawn" and context.config.imports_all:
+            seen = [*views[: own.keyframes], *shown]
+            begun = most_drawn(fused, usable, valid.pairs, context, robot=own.robot, views=seen)
+        elif context.config.finer is not None and context.config.imports_all:
             begun = from_finest_views(
                 fused,
                 usable,
                 poses,
                 context,
                 robot=own.robot,
-                factor=factor,
+                factor=context.config.finer,
                 depth_images=_depth_images(own),
                 depth_kinds=result.depth_of,
             )

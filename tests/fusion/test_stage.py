@@ -11,7 +11,7 @@ import pytest
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import ColorConfig, MapMatching
-from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.config.fusion import FinetuneConfig, FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.stage import run_fusion
@@ -213,6 +213,23 @@ def test_what_only_a_neighbor_saw_is_imported(robot, tmp_path):
     assert colors.is_identity
     assert colors.matches == 0
     np.testing.assert_allclose(colors.sigma_gain, np.sqrt(2) * ColorConfig().prior_gain)
+
+
+def test_a_merge_has_no_more_gaussians_than_it_may(robot, tmp_path):
+    """A Gaussian of alpha that bravo did not see comes in, and as many of bravo's go as must."""
+    theta = np.zeros((1, 13))
+    theta[:, 3:9], theta[:, 12] = -8 * np.array([1, 1, 1, 0, 0, 0]), 4.0
+    theta[:, 2] = -3.0
+    other = Evidence("alpha", np.array([40]), np.zeros(1), theta, np.ones((1, 31)))
+    result = result_of(robot, robot.T_map_keyframe, alpha=other)
+    source = AgentInput("bravo", robot.log, robot.frontend, robot.information, 1e-3)
+    training = FinetuneConfig(steps_per_view=1, peer_views=2)
+    config = FusionConfig(final_start="drawn", most_final=5, explained_opacity=0.0, finetune=training)
+    run_fusion(source, result, tmp_path, **SETTINGS | {"config": config})
+    (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.REFINED_MAP.of("bravo")])
+    refined = record.message().gaussians
+    assert len(refined) == 5
+    assert len(np.unique(refined.ids)) == 5
 
 
 def test_a_neighbor_that_contradicts_own_images_is_left_out(robot, tmp_path):
