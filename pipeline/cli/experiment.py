@@ -119,7 +119,7 @@ def report(
 ) -> None:
     """Judge the results in a folder and write their page; a result made under another rule is refused.
 
-    Writes `index.html`, `experiments.md` and `verdicts.json`.
+    Writes `index.html`, `experiments.md`, `verdicts.json`, and `costs.md`: what the runs took.
 
     Example: `duagc experiment report outputs/experiments`
     """

@@ -14,6 +14,7 @@ from duagc.pipeline.base.files import new_file
 from duagc.pipeline.base.random_streams import generator
 from duagc.pipeline.base.templates import filled
 from duagc.pipeline.experiments.carry_out import RESULT, check_rule, read_result
+from duagc.pipeline.experiments.costs import write_costs
 from duagc.pipeline.experiments.rule import RULES, Experiment, Metric, Rule, read_experiment
 from duagc.pipeline.experiments.statistics import bca_interval, mean
 from duagc.pipeline.experiments.verdicts import (
@@ -75,7 +76,7 @@ def judge_folder(out: Path, rules: Path = RULES) -> list[JudgedExperiment]:
 
 
 def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
-    """Write page, Markdown, verdicts and figures of experiments.
+    """Write page, Markdown, verdicts, costs and figures of experiments.
 
     Args:
         out: folder of all experiments.
@@ -89,6 +90,7 @@ def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
     _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, sections=sections))
     verdicts = {one.experiment.name: [_document(v) for v in one.verdicts] for one in judged}
     _write(out / VERDICTS, json.dumps(verdicts, indent=2, allow_nan=False) + "\n")
+    write_costs(out, [one.experiment.name for one in judged])
 
 
 def _write(path: Path, text: str) -> None:
