@@ -88,8 +88,8 @@ def write_costs(out: Path, experiments: Sequence[str]) -> None:
 
 def _key(name: str) -> str:
     """Numbers of all robots count alike."""
-    first, *_, last = name.split(".")
-    return f"robots.*.{last}" if first == "robots" else name
+    parts = name.split(".")
+    return f"robots.*.{parts[-1]}" if parts[0] == "robots" else name
 
 
 def _cost(experiment: str, configuration: str, runs: int, numbers: dict[str, list[float]]) -> Cost:

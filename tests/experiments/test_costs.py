@@ -35,7 +35,11 @@ def table(path: Path) -> Path:
         rows += [
             row("plain", seed, f"robots.{name}.gaussians_fused", n) for name, n in (("a", 10), ("b", 30))
         ]
-    rows += [row("other", 0, "team.robots", 4.0), row("other", 0, "exchange.rounds", None)]
+    rows += [
+        row("other", 0, "seed", 0.0),
+        row("other", 0, "team.robots", 4.0),
+        row("other", 0, "exchange.rounds", None),
+    ]
     rows += [row("other", 1, "team.robots", 100.0, state="failed")]
     path.mkdir()
     pq.write_table(pa.Table.from_pylist(rows), path / TABLE)
