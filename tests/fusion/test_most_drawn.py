@@ -61,13 +61,13 @@ def start(own, peers, *, pairs=None, information=1.0, most=None):
 
 def test_what_is_hidden_gives_way_to_what_a_peer_draws():
     front, hidden = wall(2.0), wall(2.5, columns=5, across_m=-0.75)
-    beside = wall(2.0, columns=5, across_m=0.6)
-    found = start(together(front, hidden), {"bravo": beside})
+    right = wall(2.0, columns=5, across_m=0.6)
+    found = start(together(front, hidden), {"bravo": right})
     assert len(found) == len(front) + len(hidden)
     assert found.ids.tolist() == [*range(64), *range(89, 89 + 25)], (
-        "the own wall, then what bravo has beside it"
+        "the own wall, then what bravo has right of it"
     )
-    np.testing.assert_allclose(found.means[64:], beside.means, atol=1e-6)
+    np.testing.assert_allclose(found.means[64:], right.means, atol=1e-6)
 
 
 def test_of_what_draws_alike_the_larger_stays():
@@ -79,13 +79,13 @@ def test_of_what_draws_alike_the_larger_stays():
 
 def test_what_the_fused_map_stands_for_does_not_come_again():
     hidden = together(wall(2.0), wall(2.5, across_m=-0.75))
-    beside = wall(2.0, across_m=0.6)
+    right = wall(2.0, across_m=0.6)
     both = np.stack([np.arange(64), np.arange(64)], axis=1)
-    assert start(hidden, {"bravo": beside}, pairs={("alpha", "bravo"): both}).ids.max() < 128
-    assert start(hidden, {"bravo": beside}, information=0.0).ids.max() < 128
-    once = start(hidden, {"bravo": beside, "charlie": beside}, pairs={("bravo", "charlie"): both})
+    assert start(hidden, {"bravo": right}, pairs={("alpha", "bravo"): both}).ids.max() < 128
+    assert start(hidden, {"bravo": right}, information=0.0).ids.max() < 128
+    once = start(hidden, {"bravo": right, "charlie": right}, pairs={("bravo", "charlie"): both})
     assert len(once) == len(hidden)
-    assert np.sum(once.means[:, 0] > 0) == len(beside), "matched peers' Gaussians count once"
+    assert np.sum(once.means[:, 0] > 0) == len(right), "matched peers' Gaussians count once"
 
 
 @pytest.mark.parametrize("most", [50, 1000])
