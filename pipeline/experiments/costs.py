@@ -98,15 +98,15 @@ def _cost(experiment: str, configuration: str, runs: int, numbers: dict[str, lis
 
     robots = of("team.robots")
     return Cost(
-        experiment,
-        configuration,
-        runs,
-        robots,
-        of("time.cpu_s") / robots,
-        of("time.peak_rss_mb"),
-        of("exchange.bytes_sent") / robots,
-        of("exchange.rounds"),
-        of("robots.*.gaussians_fused"),
+        experiment=experiment,
+        configuration=configuration,
+        runs=runs,
+        robots=robots,
+        cpu_s=of("time.cpu_s") / robots,
+        memory_mb=of("time.peak_rss_mb"),
+        sent_bytes=of("exchange.bytes_sent") / robots,
+        rounds=of("exchange.rounds"),
+        gaussians=of("robots.*.gaussians_fused"),
     )
 
 

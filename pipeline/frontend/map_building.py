@@ -24,7 +24,7 @@ from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.output import BuiltMap, Maps
 from duagc.pipeline.frontend.tile_checkpoints import TileCheckpoints
-from duagc.pipeline.frontend.tiles import Sight, border_keyframes, make_tiles, take_tile
+from duagc.pipeline.frontend.tiles import ViewExtent, border_keyframes, make_tiles, take_tile
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry import se3
@@ -75,7 +75,7 @@ class MapBuilder:
         self._free = FreeSpace(log.camera, config.moving)
         self._whole = GrowingMap(config.mapping, threads=threads)
         self._keyframes: Sequence[Keyframe] = ()
-        self._sights: list[Sight] = []
+        self._sights: list[ViewExtent] = []
         self._tiles: list[list[int]] = []
         self._kept: Mapper | None = None  # the last tile that grew
         self._poses: dict[int, Array] = {}  # T_map_camera of views by frame index, as refined so far
@@ -122,7 +122,7 @@ class MapBuilder:
         for keyframe in keyframes:
             depth_m = self.log.frame(keyframe.frame_index).usable_depth
             self._free.add(depth_m, keyframe.T_map_camera)
-            self._sights.append(Sight.of(depth_m, self.log.camera))
+            self._sights.append(ViewExtent.of(depth_m, self.log.camera))
         centers = [
             se3.transform(k.T_map_camera, sight.center_camera[None])[0]
             for k, sight in zip(keyframes, self._sights, strict=True)
@@ -192,7 +192,7 @@ class MapBuilder:
             for frame in supporting:
                 depth_m = self.log.frame(frame.frame_index).usable_depth
                 T_map_camera = self._pose(frame.keyframe_index) @ frame.T_keyframe_camera
-                seen.append((Sight.of(depth_m, self.log.camera), T_map_camera))
+                seen.append((ViewExtent.of(depth_m, self.log.camera), T_map_camera))
             begun = take_tile(self._whole, tile, seen[: len(tile)], seen[len(tile) :])
         mapper = Mapper(
             self.log.camera,

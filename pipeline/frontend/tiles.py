@@ -62,7 +62,7 @@ def make_tiles(centers_map: Array, most: int) -> list[list[int]]:
 
 
 @dataclass(frozen=True)
-class Sight:
+class ViewExtent:
     """How far a view sees.
 
     Attributes:
@@ -78,7 +78,7 @@ class Sight:
     points_camera: NDArray[np.float32]
 
     @staticmethod
-    def of(depth_m: NDArray[np.float32], camera: PinholeCamera) -> Sight:
+    def of(depth_m: NDArray[np.float32], camera: PinholeCamera) -> ViewExtent:
         """Of a view.
 
         Args:
@@ -98,7 +98,7 @@ class Sight:
         v, u = np.nonzero(depth_m[first::step, first::step])
         v, u = first + step * v, first + step * u
         points = back_project(camera, u, v, depth_m[v, u]).astype(np.float32)
-        return Sight(camera, ndimage.maximum_filter(blocks, 3), center, points)
+        return ViewExtent(camera, ndimage.maximum_filter(blocks, 3), center, points)
 
     def sees(
         self, means_map: NDArray[np.float32], radii_m: NDArray[np.float32], T_map_camera: Array
@@ -132,7 +132,7 @@ class Sight:
 
 
 def border_keyframes(
-    tile: Sequence[int], others: Iterable[int], views: Sequence[tuple[Sight, Array]], most: int
+    tile: Sequence[int], others: Iterable[int], views: Sequence[tuple[ViewExtent, Array]], most: int
 ) -> list[int]:
     """Keyframes of other tiles that look into what a tile shows, evenly spread over all of them, ascending.
 
@@ -158,8 +158,8 @@ def border_keyframes(
 def take_tile(
     whole: GrowingMap,
     keyframes: Sequence[int],
-    own: Sequence[tuple[Sight, Array]],
-    other: Sequence[tuple[Sight, Array]],
+    own: Sequence[tuple[ViewExtent, Array]],
+    other: Sequence[tuple[ViewExtent, Array]],
 ) -> GrowingMap:
     """Take out of a map what the views of a tile may see, and all that the tile owns.
 
@@ -178,7 +178,7 @@ def take_tile(
     return whole.take(np.concatenate([uncounted, counted]), np.flatnonzero(owned), len(uncounted))
 
 
-def _seen(rows: Indices, whole: GrowingMap, views: Sequence[tuple[Sight, Array]]) -> Indices:
+def _seen(rows: Indices, whole: GrowingMap, views: Sequence[tuple[ViewExtent, Array]]) -> Indices:
     """Those of some Gaussians that some view may see."""
     means = whole.gaussians.means[rows]
     radii_m = np.float32(SIGMAS) * np.exp(whole.gaussians.log_scales[rows].max(axis=1, initial=-np.inf))

@@ -52,7 +52,7 @@ def most_drawn(
     """
     next_id = int(fused.gaussians.ids.max()) + 1 if len(fused.gaussians) else 0
     parts = [fused.gaussians]
-    for name, rows in _others(fused, evidence, pairs, robot, context):
+    for name, rows in _others(fused, evidence, pairs, robot=robot, context=context):
         theirs = fused.colors[name].of(evidence[name].select(rows))
         parts.append(gaussians_of(next_id + np.arange(len(rows)), theirs.anchors, theirs.theta))
         next_id += len(rows)
@@ -67,7 +67,7 @@ def most_drawn(
 
 
 def _others(
-    fused: FusedMap, evidence: Mapping[str, Evidence], pairs: Pairs, robot: str, context: MapContext
+    fused: FusedMap, evidence: Mapping[str, Evidence], pairs: Pairs, *, robot: str, context: MapContext
 ) -> Iterator[tuple[str, NDArray[np.int64]]]:
     """Of every peer the rows of what the fused map does not stand for; of matched peers that of the lowest name."""
     for name in sorted(evidence):

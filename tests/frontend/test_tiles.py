@@ -8,7 +8,7 @@ import pytest
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping import Mapper
-from duagc.pipeline.frontend.tiles import Sight, border_keyframes, make_tiles, take_tile
+from duagc.pipeline.frontend.tiles import ViewExtent, border_keyframes, make_tiles, take_tile
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
 from duagc.pipeline.kernels.training import TrainingStep, TrainingView
@@ -32,7 +32,7 @@ def test_every_keyframe_is_in_one_tile_with_its_neighbors() -> None:
 
 
 def test_the_border_looks_into_the_tile_from_all_sides() -> None:
-    sight = Sight.of(np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), CAMERA)
+    sight = ViewExtent.of(np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), CAMERA)
     along = [(sight, se3.exp(np.array([0.5 * k, 0, 0, 0, 0, 0]))) for k in range(20)]
     assert border_keyframes([9, 10], range(20), along, 100) == [*range(5, 9), *range(11, 15)]
     assert border_keyframes([9, 10], range(20), along, 4) == [6, 8, 12, 14]
@@ -59,7 +59,7 @@ def test_a_view_sees_what_is_in_it_and_not_behind_its_depth(
     depth_m[:, 44:] = 0.0
     T_map_camera = se3.exp(np.array([0.3, -0.2, 0.1, 0.2, 0.4, -0.1]))
     means = se3.transform(T_map_camera, np.array([point])).astype(np.float32)
-    found = Sight.of(depth_m, CAMERA).sees(means, np.array([radius_m], np.float32), T_map_camera)
+    found = ViewExtent.of(depth_m, CAMERA).sees(means, np.array([radius_m], np.float32), T_map_camera)
     assert found.tolist() == [seen]
 
 
@@ -70,8 +70,8 @@ def _grown(views: int) -> GrowingMap:
     return mapper.growing_map
 
 
-def _sights(keyframes: Iterable[int]) -> list[tuple[Sight, np.ndarray]]:
-    return [(Sight.of(shot(POSES[k])[1], CAMERA), POSES[k]) for k in keyframes]
+def _sights(keyframes: Iterable[int]) -> list[tuple[ViewExtent, np.ndarray]]:
+    return [(ViewExtent.of(shot(POSES[k])[1], CAMERA), POSES[k]) for k in keyframes]
 
 
 def _by_id(gaussians: Gaussians) -> Gaussians:
