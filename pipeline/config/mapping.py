@@ -45,8 +45,8 @@ class MappingConfig(Config):
     """How the map is grown and optimized."""
 
     max_gaussians: int = 60_000
-    """Hard cap of a tile, with what its keyframes see of others; half of it is there for its own in any case. When a
-    keyframe would exceed it, the Gaussians whose removal changes the keyframes least go first."""
+    """Hard cap of a tile's own Gaussians; with those of others that it sees, of twice as many. When a keyframe would
+    exceed it, the Gaussians whose removal changes the keyframes least go first."""
     tile_keyframes: int = Field(default=64, ge=2)
     """Most keyframes of a tile: a longer log has a map of several, each optimized with the images of its keyframes."""
     border_keyframes: int = Field(default=24, ge=0)

@@ -67,14 +67,19 @@ class GrowingMap:
 
     @property
     def cap(self) -> int:
-        """Most Gaussians while the map grows: half of the cap is there for new ones, however many guests there are."""
-        most, counted = self.config.max_gaussians, self.guests - self.uncounted
-        return max(most, counted + most // 2) + self.uncounted
+        """Most Gaussians while the map grows; half of the configured cap is there for own ones in any case."""
+        return self.guests + max(self.config.max_gaussians // 2, self._own_cap)
 
     @property
     def room(self) -> int:
         """How many Gaussians may be added where the map is drawn worst."""
-        return max(0, self.config.max_gaussians + self.uncounted - len(self))
+        return max(0, self._own_cap - (len(self) - self.guests))
+
+    @property
+    def _own_cap(self) -> int:
+        """Most own Gaussians: the configured cap, as long as all that the views see is at most twice that."""
+        most, counted = self.config.max_gaussians, self.guests - self.uncounted
+        return min(most, 2 * most - counted)
 
     def take(self, guests: NDArray[np.int64], own: NDArray[np.int64], uncounted: int) -> GrowingMap:
         """Take Gaussians out, into a map of their own, where new ones are made.

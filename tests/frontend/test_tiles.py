@@ -178,12 +178,14 @@ def test_guests_leave_room_for_what_a_tile_adds() -> None:
     crowded = GrowingMap(config)
     crowded.append(_grown(1).gaussians)
     guests = len(crowded)
-    assert guests > 100
-    part = crowded.take(np.arange(guests), np.zeros(0, np.int64), uncounted=0)
+    assert guests > 200
+    none = np.zeros(0, np.int64)
+    part = crowded.take(np.arange(guests), none, uncounted=0)
     assert part.cap == guests + 50
     assert part.room == 0
     assert part.prune_least(10) == 0  # there are only guests
     part.put_back(crowded)
-    free = part.take(np.arange(guests), np.zeros(0, np.int64), uncounted=guests)
-    assert free.cap == guests + 100
-    assert free.room == 100
+    part = part.take(np.arange(guests), none, uncounted=guests - 120)
+    assert (part.cap, part.room) == (guests + 80, 80)  # twice the cap, all that views see
+    free = part.take(np.arange(guests), none, uncounted=guests)
+    assert (free.cap, free.room) == (guests + 100, 100)
