@@ -163,7 +163,7 @@ class TimeLeft:
 
     def _left_of_stage(self, name: str, predicted: float, since: float, now: float) -> float:
         """Seconds of a stage of the team that is at work."""
-        if name == stages.EVALUATION.name and any(w.now is not None for w in self._evaluation.of.values()):
+        if name == stages.EVALUATION.name and self._evaluation.begun:
             return self._evaluation.left_s(now, self._rate_of(name, now))
         whole = self._rate_of(name, now) * predicted
         return max(whole - (now - since), LEAST_LEFT * whole)
@@ -207,4 +207,6 @@ def in_words(seconds: float) -> str:
     """
     if seconds < 100:
         return f"{seconds:.0f} s"
+    if seconds < 570:
+        return f"{round(seconds / 30) / 2:g} min"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -119,4 +119,4 @@ def test_a_line_says_where_the_robots_are() -> None:
     line = simulated.times.line()
     assert line.startswith("robot0: tracking 30/300, robot1: final 100/1000; ")
     assert line.endswith(" left of the run")
-    assert [in_words(s) for s in (7.4, 150.0, 8000.0)] == ["7 s", "2 min", "2.2 h"]
+    assert [in_words(s) for s in (7.4, 150.0, 8000.0)] == ["7 s", "2.5 min", "2.2 h"]

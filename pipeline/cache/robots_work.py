@@ -142,6 +142,11 @@ class RobotsWork:
         for work in self.of.values():
             work.end(now)
 
+    @property
+    def begun(self) -> bool:
+        """Whether a robot has begun, or all is done."""
+        return any(work.now is not None or work.ended for work in self.of.values())
+
     def predicted_s(self) -> float:
         """Seconds until all is done, before anything is known."""
         whole = [self._slower * work.whole_s() for work in self.of.values()]
