@@ -107,11 +107,12 @@ def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
         robots: of the team, with itself; its maps are drawn at the views of the others.
     """
     views, keyframes = min(VIEWS, size["frames"] / HELD_OUT), min(VIEWS, size["keyframes"])
+    of_peers = min(VIEWS, (robots - 1) * size["frames"] / HELD_OUT)
     scored_s, compared_s = _of_pixels(SCORED_S, size), _of_pixels(COMPARED_S, size)
     return {
         "held_out": scored_s * RENDERS * views,
         "training": scored_s * KEYFRAME_RENDERS * keyframes,
-        "peers": scored_s * PEER_RENDERS * views if robots > 1 else 0.0,
+        "peers": scored_s * PEER_RENDERS * of_peers,
         "agreement": compared_s * views,
     }
 
