@@ -307,7 +307,7 @@ class Job:
         return workers_that_fit(list(sizes.values()), self.carrier, self.plan.workers, share=share)
 
     def _sizes(self, robots: Sequence[str]) -> dict[str, dict[str, int]]:
-        return {robot: steps.check_log(self.recording.log(robot), robot) for robot in robots}
+        return {name: steps.check_log(self.recording.log(name), robot_of(name)) for name in robots}
 
     def _looking_carrier(self) -> Carrier:
         return replace(self.carrier, looking=True)
