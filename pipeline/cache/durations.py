@@ -32,6 +32,8 @@ FUSED_VIEW_S = (0.12, 1.00)
 """Of a view that its fused map is trained on: in any case, and for every million pixels."""
 SCORED_S, COMPARED_S = (0.027, 0.157), (0.02, 0.82)
 """The same of a render that is scored, and of a view that is compared with the others."""
+SURFACE_S = 2.0
+"""Of an evaluation, for its logs and the true surface."""
 VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
 RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
@@ -113,7 +115,7 @@ def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
         "held_out": scored_s * RENDERS * views,
         "training": scored_s * KEYFRAME_RENDERS * keyframes,
         "peers": scored_s * PEER_RENDERS * of_peers,
-        "agreement": compared_s * views,
+        "agreement": SURFACE_S + compared_s * views,
     }
 
 
