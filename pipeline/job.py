@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from duagc import __version__
 from duagc.pipeline import steps
@@ -33,6 +33,7 @@ from duagc.pipeline.time_left import EVERY_S, TimeLeft
 from duagc.pipeline.watch import Watch, ticking
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
+Found = TypeVar("Found")
 READER_SHARE = 2.0  # memory of the evaluation of a robot, relative to its preparation
 FUSION_SHARE = 1.5  # the same of its fusion
 READERS = (stages.EVALUATION.name, stages.REPORT.name, stages.VIEW.name)
@@ -219,18 +220,11 @@ class Job:
     def _fused(self, chain: Chain, prepared: dict[str, Prepared], exchange: Carried) -> list[Carried]:
         """The fused map of every robot; `workers` at a time in processes of their own."""
         looking = Chain(self.recording, self._looking_carrier(), self.digests)
-        found, absent = dict[str, Carried](), list[str]()
-        for name, robot in prepared.items():
-            try:
-                found[name] = looking.fusion(name, robot, exchange, threads=1)
-            except NotStoredError as error:
-                self.missing.append(error.key)
-                absent.append(name)
+        found, absent = self._looked_up(
+            prepared, lambda name: looking.fusion(name, prepared[name], exchange, threads=1)
+        )
         if self.carrier.looking:
-            if absent:
-                raise NotStoredError(self.missing[0])
             return list(found.values())
-        self.missing.clear()
         workers, fused = self._fitting(self._sizes(absent), FUSION_SHARE), dict[str, Carried]()
         if workers > 1:
             self.log(f"fusion: {len(absent)} robots, {workers} at a time")
@@ -244,6 +238,23 @@ class Job:
                 self.log(f"warning: {name} uses nothing of {neighbor}'s map: {reason}")
         return done
 
+    def _looked_up(
+        self, robots: Iterable[str], look: Callable[[str], Found]
+    ) -> tuple[dict[str, Found], list[str]]:
+        """What the store has of some robots, by name, and those of which it has nothing."""
+        found, absent = dict[str, Found](), list[str]()
+        for robot in robots:
+            try:
+                found[robot] = look(robot)
+            except NotStoredError as error:
+                self.missing.append(error.key)
+                absent.append(robot)
+        if not self.carrier.looking:
+            self.missing.clear()
+        elif absent:
+            raise NotStoredError(self.missing[0])
+        return found, absent
+
     def _processes(self) -> RobotProcesses:
         return RobotProcesses(
             self.recording.path, self.folder, self.config, self.plan, self._place, self._where
@@ -253,20 +264,13 @@ class Job:
         """Every robot with its own results, by name; `workers` at a time in processes of their own."""
         alone = not self.plan.has(stages.INFORMATION)
         looking = Chain(self.recording, self._looking_carrier(), self.digests)
-        found: dict[str, Prepared] = {}
-        absent = []
-        for robot in self.recording.robots:
-            try:
-                found |= looking.robot(robot, threads=1, alone=alone)
-            except NotStoredError as error:
-                self.missing.append(error.key)
-                absent.append(robot)
+        stored, absent = self._looked_up(
+            self.recording.robots, lambda robot: looking.robot(robot, threads=1, alone=alone)
+        )
+        found = {name: part for of_robot in stored.values() for name, part in of_robot.items()}
         if self.carrier.looking:
-            if absent:
-                raise NotStoredError(self.missing[0])
             return dict(sorted(found.items()))
-        self.missing.clear()
-        for robot in set(self.recording.robots) - set(absent):
+        for robot in stored:
             found |= chain.robot(robot, threads=threads_per_worker(1), alone=alone)
         if absent:
             sizes = self._sizes(absent)
