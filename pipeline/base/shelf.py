@@ -46,7 +46,8 @@ class Shelf:
         """An equal object, whose arrays are in a file and cannot be written.
 
         Args:
-            value: data classes and tuples with arrays; what is None or anything else is taken as it is.
+            value: data classes and tuples with arrays; arrays that are in a file, and anything else, are taken as they
+                are.
         """
         arrays: list[np.ndarray] = []
         _collect(value, arrays)
@@ -94,9 +95,19 @@ class Shelf:
         return mapping
 
 
+def _in_memory(value: Any) -> bool:
+    """Whether something is an array that lies in no file."""
+    if not isinstance(value, np.ndarray):
+        return False
+    base: Any = value
+    while isinstance(base, np.ndarray):
+        base = base.base
+    return not isinstance(base.obj if isinstance(base, memoryview) else base, _Mapping)
+
+
 def _collect(value: Any, arrays: list[np.ndarray]) -> None:
-    """All arrays of an object, in order."""
-    if isinstance(value, np.ndarray):
+    """All arrays of an object that are in no file, in order."""
+    if _in_memory(value):
         arrays.append(value)
     elif isinstance(value, tuple):
         for part in value:
@@ -107,8 +118,8 @@ def _collect(value: Any, arrays: list[np.ndarray]) -> None:
 
 
 def _rebuilt(value: Any, views: Iterator[np.ndarray]) -> Any:
-    """The object with other arrays, in the same order."""
-    if isinstance(value, np.ndarray):
+    """The object with other arrays in the place of those that are in no file, in the same order."""
+    if _in_memory(value):
         return next(views)
     if isinstance(value, tuple):
         return tuple(_rebuilt(part, views) for part in value)

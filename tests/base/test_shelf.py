@@ -1,6 +1,6 @@
 """Arrays in files: equal, read-only, given back, and in memory where there is no room."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,17 @@ def test_pages_are_given_back_and_come_again() -> None:
     kept.sweep()
     assert _resident_kb() < before - 30_000
     assert [float(value[0].sum()) for value in values] == [1e6 * k for k in range(5)]
+
+
+def test_what_is_in_a_file_is_not_written_again() -> None:
+    kept = shelf.Shelf()
+    first = kept.put(_Picture("first", np.ones((300, 300)), None))
+    second = kept.put(replace(first, name="second", mask=np.ones((300, 300), bool)))
+    assert second.pixels is first.pixels
+    assert second.mask is not None
+    assert not second.mask.flags.writeable
+    assert kept.put(second).mask is second.mask
+    assert len(kept) == 2
 
 
 def test_small_objects_stay_in_memory() -> None:
