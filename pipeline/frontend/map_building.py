@@ -176,7 +176,7 @@ class MapBuilder:
     def _mapper(
         self, number: int, others: Sequence[int], *, taken: bool, supporting: Sequence[TrackedFrame] = ()
     ) -> Mapper:
-        """The mapper of a tile, with the keyframes of others that are nearest.
+        """The mapper of a tile, with keyframes of others that look into it.
 
         Args:
             number: of the tile.
@@ -219,7 +219,8 @@ class MapBuilder:
     ) -> tuple[MappingStats, dict[int, Array], Any]:
         """Optimize all tiles in turn; counts, poses of the views by frame index, and the state of the map."""
         part, every = f"{self.name}.final", range(len(self._keyframes))
-        of_tile = [[f for f in supporting if f.keyframe_index in set(tile)] for tile in self._tiles]
+        tile_of = {k: number for number, tile in enumerate(self._tiles) for k in tile}
+        of_tile = [[f for f in supporting if tile_of[f.keyframe_index] == n] for n in range(len(self._tiles))]
         shares_s = [log_s * len(t) / len(every) if len(self._tiles) > 1 else log_s for t in self._tiles]
         borders = [len(self._border(tile, every)) for tile in self._tiles]
         plans = [
