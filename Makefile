@@ -41,8 +41,9 @@ $(STAMP): $(SOURCES)
 demo: setup
 	$(BIN)/duagc demo --out $(DEMO) --force
 
+# A test that does not end is said, with what every thread was at, instead of being waited for.
 test: setup
-	$(BIN)/python -m pytest -m "not slow" $(TEST_OPTIONS)
+	$(BIN)/python -m pytest -m "not slow" -o faulthandler_timeout=300 -o faulthandler_exit_on_timeout=true $(TEST_OPTIONS)
 
 # Four runs made again and compared, message by message, with what is stored under tests/golden.
 golden: setup

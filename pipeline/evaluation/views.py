@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from threading import local
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.evaluation import image_metrics
 from duagc.pipeline.evaluation.exposure import fitted_psnr
@@ -255,14 +255,7 @@ def score_maps(
             )
         return frame.index, scores
 
-    with ThreadPoolExecutor(threads) as pool:
-        batch: list[ScoredFrame] = []
-        for view in views:  # frames are read by this thread only, a few at a time
-            batch.append(view)
-            if len(batch) == 4 * threads:
-                yield from pool.map(score, batch)
-                batch = []
-        yield from pool.map(score, batch)
+    yield from in_order(score, views, threads)
 
 
 def summary(scores: Sequence[ViewScore | Absent], reason_if_none: str) -> dict[str, Any]:

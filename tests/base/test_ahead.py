@@ -36,5 +36,28 @@ def test_an_error_comes_in_its_place():
     assert got == list(range(5))
 
 
+def test_results_that_nobody_takes_are_dropped_without_waiting():
+    """As the garbage collector drops them, at a moment that may be the wrong one to wait for a thread."""
+    go_on, begun = threading.Event(), []
+
+    def wait(k):
+        if k > 0:
+            go_on.wait(60)
+        begun.append(k)
+
+    found = in_order(wait, range(100), threads=2)
+    next(found)
+    dropped = threading.Thread(target=found.close, daemon=True)
+    dropped.start()
+    dropped.join(10)
+    closed = not dropped.is_alive()
+    go_on.set()
+    assert closed
+    for thread in threading.enumerate():
+        if thread.name.startswith("ThreadPoolExecutor"):
+            thread.join(10)
+    assert len(begun) <= 3
+
+
 def test_nothing_gives_nothing():
     assert list(in_order(str, [])) == []
