@@ -11,16 +11,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 from duagc.pipeline.base.machine import processors
+from duagc.pipeline.base.worker_reports import OF_TEAM
 from duagc.pipeline.cache import durations
 from duagc.pipeline.cache.durations import Size
-from duagc.pipeline.cache.robots_work import LEAST_LEFT, START, TRUSTED_S, RobotsWork, RobotWork
+from duagc.pipeline.cache.robots_work import LEAST_LEFT, START, TRUSTED_S, RobotsWork, RobotWork, kind_of
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.runs import stages
 
 EVERY_S = 10.0
 KEYFRAMES_OF_FRAMES = 0.06
 """Until the keyframes of a robot are known."""
-UNHEARD = ("poses", "agreement")
+UNHEARD = ("poses", "surface", "agreement")
 """Parts of a front end, and of an evaluation, that do not say how far they are."""
 PARTS = {"tracking again": "tracking", "keyframes": "poses"}
 """Parts of a front end that are not named as in `durations`."""
@@ -28,6 +29,8 @@ IMAGES = (START, "tracking", "poses", "model")
 """Parts of a front end that take as long as images are large, as the evaluation does."""
 GAUSSIANS = ("mapping", "final")
 """Parts of a front end that take as long as the map has Gaussians, as fusion does."""
+EVALUATION_OF_TEAM = f"{stages.EVALUATION.name} of the team"
+"""What follows the evaluation of each robot."""
 LIKE = {stages.FUSION.name: GAUSSIANS, stages.EVALUATION.name: IMAGES}
 """Parts of the front end that a stage is like; any other is like all of them."""
 
@@ -77,6 +80,9 @@ class TimeLeft:
         """What follows the front ends, in order: stages, and predicted seconds; fusion robot by robot, or of all."""
         team, reading = self._sizes | self._found, self._reading
         works = {name: RobotWork(_evaluation(name, size, list(team)), UNHEARD) for name, size in team.items()}
+        if reading > 1:  # worker processes start
+            for work in list(works.values())[:reading]:
+                work.parts = {START: durations.START_S, **work.parts}
         one_s, many = durations.threaded_s(1.0, processors()), durations.slowdown(reading, processors())
         sizes = list(team.values())
         slower = one_s if reading == 1 else many
@@ -92,6 +98,9 @@ class TimeLeft:
             (stages.VIEW, durations.READERS_S / 2),
         ]
         self._later = [(stage.name, seconds) for stage, seconds in expected if stage in self._wanted]
+        if stages.EVALUATION in self._wanted:
+            after = 1 + [name for name, _ in self._later].index(stages.EVALUATION.name)
+            self._later.insert(after, (EVALUATION_OF_TEAM, durations.evaluation_of_team_s(len(team))))
 
     def step(self, robot: str, part: str, done: int, total: int) -> None:
         """A step of a front end, or of the evaluation of a robot.
@@ -105,6 +114,8 @@ class TimeLeft:
         with self._lock:
             now = self._clock()
             if self._now is not None and self._now[0] == stages.EVALUATION.name:
+                if robot == OF_TEAM:
+                    self._go_on(EVALUATION_OF_TEAM, now)
                 self._evaluation.step(robot, part, done / max(total, 1), now)
                 return
             work = self._front.of.get(robot)
@@ -132,15 +143,21 @@ class TimeLeft:
             now = self._clock()
             self._front.end(now)
             self._words.clear()
-            if self._now is not None:
-                before, predicted, since = self._now
-                taken = self._taken.get(before, (0.0, 0.0))
-                self._taken[before] = taken[0] + now - since, taken[1] + predicted
-            self._now = None
-            if stage in (name for name, _ in self._later):
-                while self._later[0][0] != stage:
-                    self._later.pop(0)
-                self._now = *self._later.pop(0), now
+            self._go_on(stage, now)
+            if stage == stages.EVALUATION.name:
+                self._evaluation.start(now)
+
+    def _go_on(self, stage: str, now: float) -> None:
+        """What was done took so long; what is predicted of a stage begins, or the next part of it."""
+        if self._now is not None:
+            before, predicted, since = self._now
+            taken = self._taken.get(kind_of(before), (0.0, 0.0))
+            self._taken[kind_of(before)] = taken[0] + now - since, taken[1] + predicted
+        self._now = None
+        if stage in (name for name, _ in self._later):
+            while self._later[0][0] != stage:
+                self._later.pop(0)
+            self._now = *self._later.pop(0), now
 
     def left_s(self) -> float:
         """Seconds until the run is done."""
@@ -170,8 +187,8 @@ class TimeLeft:
 
     def _rate_of(self, stage: str, now: float) -> float:
         """Measured seconds of a stage for every predicted one; its own once something of it is done."""
-        parts = LIKE.get(stage, (*IMAGES, *GAUSSIANS))
-        measured, predicted = self._taken.get(stage, (0.0, 0.0))
+        parts = LIKE.get(kind_of(stage), (*IMAGES, *GAUSSIANS))
+        measured, predicted = self._taken.get(kind_of(stage), (0.0, 0.0))
         return (TRUSTED_S * self._front.rate(now, parts) + measured) / (TRUSTED_S + predicted)
 
 
@@ -187,6 +204,7 @@ def _evaluation(robot: str, size: Size, team: Sequence[str]) -> dict[str, float]
         f"held_out of {robot}": parts["held_out"],
         f"training of {robot}": parts["training"],
         **{f"peers of {peer}": parts["peers"] / len(peers) for peer in peers},
+        "surface": parts["surface"],
         "agreement": parts["agreement"],
     }
 

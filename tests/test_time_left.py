@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import pytest
 
 from duagc.pipeline.base import machine
+from duagc.pipeline.base.worker_reports import OF_TEAM
 from duagc.pipeline.cache import durations
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.runs import stages
-from duagc.pipeline.time_left import TimeLeft, in_words
+from duagc.pipeline.time_left import EVALUATION_OF_TEAM, TimeLeft, in_words
 
 MAPPING = MappingConfig()
 STEPS = {"tracking": 50, "mapping": 12, "final": 200, "model": 50}
@@ -48,19 +50,42 @@ class Simulated:
         at += inflation * durations.information_s(size)
         return [*steps, (at, (robot, "", 0, 0))]
 
-    def run(self) -> float:
-        """The time that it takes."""
-        free, steps = [0.0] * self.workers, []
+    def evaluation(self, robot: str, begin: float) -> list[tuple[float, tuple[str, str, int, int]]]:
+        """Steps with their times; the last one is when the robot is done."""
+        at, steps = begin, []
+        inflation = self.times._evaluation._slower * self.slower
+        for part, seconds in self.times._evaluation.of[robot].parts.items():
+            count, took = 40 if " of " in part else 1, inflation * seconds * next(self.uneven)
+            steps += [(at + took * (k + 1) / count, (robot, part, k + 1, count)) for k in range(count)]
+            at += took
+        return steps
+
+    def side_by_side(
+        self, work: Callable[[str, float], list[tuple[float, tuple[str, str, int, int]]]]
+    ) -> None:
+        """The same of all robots, as many at a time as there are workers."""
+        free, steps = [self.now] * self.workers, []
         for robot in self.sizes:
             begin = min(free)
-            made = self.front_end(robot, begin)
+            made = work(robot, begin)
             free[free.index(begin)] = made[-1][0]
             steps += made
         for self.now, step in sorted(steps, key=lambda timed: timed[0]):
-            self.times.step(*step)
+            if step[1] != "start":
+                self.times.step(*step)
             self.said.append((self.now, self.times.left_s()))
+
+    def run(self) -> float:
+        """The time that it takes."""
+        self.side_by_side(self.front_end)
         for stage, seconds in list(self.times._later):
-            self.times.begin(stage)
+            if stage == EVALUATION_OF_TEAM:
+                self.times.step(OF_TEAM, "team", 0, 1)
+            else:
+                self.times.begin(stage)
+            if stage == stages.EVALUATION.name:
+                self.side_by_side(self.evaluation)
+                continue
             for _ in range(10):
                 self.said.append((self.now, self.times.left_s()))
                 self.now += self.slower * seconds / 10
@@ -110,6 +135,22 @@ def test_an_evaluation_that_is_slow_shows_while_it_is_at_work() -> None:
         for robot in ("robot0", "robot1"):
             simulated.times.step(robot, f"held_out of {robot}", 3 * step, 40)
     assert simulated.times.left_s() > before
+
+
+def test_what_follows_the_evaluation_of_robots_is_not_forgotten() -> None:
+    simulated = Simulated(8, 2, 1.0, 1.0)
+    later = dict(simulated.times._later)
+    of_robots, of_team = later["evaluation"], later[EVALUATION_OF_TEAM]
+    readers = later["report"] + later["rrd"]
+    simulated.times.begin("evaluation")
+    simulated.now = 1.5 * of_robots
+    for robot in range(8):
+        simulated.times.step(f"robot{robot}", "agreement", 1, 1)
+    simulated.times.step(OF_TEAM, "team", 0, 1)
+    left = simulated.times.left_s()
+    assert 1.2 * of_team + readers < left < 1.6 * (of_team + readers)
+    simulated.now += of_team
+    assert left - 1.5 * of_team < simulated.times.left_s() < left - 0.5 * of_team
 
 
 def test_a_line_says_where_the_robots_are() -> None:

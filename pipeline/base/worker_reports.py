@@ -10,6 +10,8 @@ from multiprocessing.queues import SimpleQueue
 
 Step = tuple[str, str, int, int]
 """Of a robot: its name, what is done of it, steps done, steps in all; 0 of 0: it is done."""
+OF_TEAM = ""
+"""In the place of a robot's name: a step of what is done for all robots together."""
 Hear = Callable[[Step], None]
 """Gets steps."""
 _queues: list[SimpleQueue[Step | None]] = []

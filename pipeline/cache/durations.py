@@ -32,8 +32,10 @@ FUSED_VIEW_S = (0.12, 1.00)
 """Of a view that its fused map is trained on: in any case, and for every million pixels."""
 SCORED_S, COMPARED_S = (0.027, 0.157), (0.02, 0.82)
 """The same of a render that is scored, and of a view that is compared with the others."""
-SURFACE_S = 2.0
-"""Of an evaluation, for its logs and the true surface."""
+SURFACE_S = 2.5
+"""Of an evaluation of a robot, for its logs and the true surface."""
+AGREED_S = 1.2
+"""Of a robot that has peers, for what all are measured by together."""
 VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
 RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
@@ -115,8 +117,18 @@ def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
         "held_out": scored_s * RENDERS * views,
         "training": scored_s * KEYFRAME_RENDERS * keyframes,
         "peers": scored_s * PEER_RENDERS * of_peers,
-        "agreement": SURFACE_S + compared_s * views,
+        "surface": SURFACE_S,
+        "agreement": compared_s * views,
     }
+
+
+def evaluation_of_team_s(robots: int) -> float:
+    """Time of what follows the evaluation of each robot.
+
+    Args:
+        robots: of the team.
+    """
+    return AGREED_S * robots if robots > 1 else 0.0
 
 
 def evaluation_s(size: Size, robots: int) -> float:

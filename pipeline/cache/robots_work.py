@@ -21,6 +21,15 @@ LEAST_LEFT = 0.1
 """Of what something takes, where it takes longer than it should."""
 
 
+def kind_of(part: str) -> str:
+    """What takes equally long for every prediction, whichever robot it is of: "peers" for "peers of bravo".
+
+    Args:
+        part: of a work.
+    """
+    return part.partition(" of ")[0]
+
+
 @dataclass
 class RobotWork:
     """What is done for a robot.
@@ -114,7 +123,15 @@ class RobotsWork:
             slower: seconds for every predicted one, with so many at work.
             now: the time, seconds.
         """
-        self.of, self._workers, self._slower, self._created_s = of, workers, slower, now
+        self.of, self._workers, self._slower, self._started_s = of, workers, slower, now
+
+    def start(self, now: float) -> None:
+        """The first robots begin: processes start for them.
+
+        Args:
+            now: the time, seconds.
+        """
+        self._started_s = now
 
     def step(self, robot: str, part: str, share: float, now: float) -> None:
         """A step was done; nothing is known of robots and parts that were not predicted.
@@ -130,7 +147,7 @@ class RobotsWork:
             return
         begun = sum(other.now is not None or other.ended for other in self.of.values())
         if work.now is None and not work.ended and begun < self._workers and START in work.parts:
-            work.now = START, self._created_s
+            work.now = START, self._started_s
         work.step(part, share, now)
 
     def end(self, now: float) -> None:
@@ -153,20 +170,21 @@ class RobotsWork:
         return durations.side_by_side_s((), whole, self._workers)
 
     def rate(
-        self, now: float, parts: Iterable[str], base: float = 1.0, trusted_s: float = TRUSTED_S
+        self, now: float, kinds: Iterable[str], base: float = 1.0, trusted_s: float = TRUSTED_S
     ) -> float:
         """Measured seconds for every predicted one.
 
         Args:
             now: the time, seconds.
-            parts: that it is of.
+            kinds: of the parts that it is of.
             base: what it is where nothing was measured.
             trusted_s: so many predicted seconds count for that.
         """
         measured, predicted = 0.0, 0.0
-        for part in parts:
-            for work in self.of.values():
-                if part in work.parts:
+        wanted = set(kinds)
+        for work in self.of.values():
+            for part in work.parts:
+                if kind_of(part) in wanted:
                     took, of = work.measured(part, now)
                     measured, predicted = measured + took, predicted + self._slower * of
         return (trusted_s * base + measured) / (trusted_s + predicted)
@@ -178,15 +196,15 @@ class RobotsWork:
             now: the time, seconds.
             base: measured seconds for every predicted one, where nothing was measured.
         """
-        every = list(dict.fromkeys(part for work in self.of.values() for part in work.parts))
+        every = {kind_of(part) for work in self.of.values() for part in work.parts}
         whole = self.rate(now, every, base)
-        rates = {part: self.rate(now, (part,), whole, TRUSTED_PART_S) for part in every}
+        rates = {kind: self.rate(now, (kind,), whole, TRUSTED_PART_S) for kind in every}
         begun, waiting = list[float](), list[float]()
         for work in self.of.values():
             if work.ended:
                 continue
             left = sum(
-                self._slower * rates[part] * seconds * (1 - work.done.get(part, 0.0))
+                self._slower * rates[kind_of(part)] * seconds * (1 - work.done.get(part, 0.0))
                 for part, seconds in work.parts.items()
             )
             if work.now is None:
@@ -194,7 +212,7 @@ class RobotsWork:
                 continue
             part, since = work.now
             if part in work.unheard:
-                part_s = self._slower * rates[part] * work.parts[part]
+                part_s = self._slower * rates[kind_of(part)] * work.parts[part]
                 left -= min(now - since, (1 - LEAST_LEFT) * part_s)
             begun.append(left)
         return durations.side_by_side_s(begun, waiting, self._workers)

@@ -55,7 +55,7 @@ def estimate(
     seconds += side_by_side_s("frontend", prepared)
     seconds += side_by_side_s("evaluation", (durations.evaluation_s(row, len(rows)) for row in rows))
     if len(rows) > 1:
-        seconds += durations.exchange_s(rows)
+        seconds += durations.exchange_s(rows) + durations.evaluation_of_team_s(len(rows))
         seconds += side_by_side_s("fusion", map(durations.fusion_s, rows))
     size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
     return {"seconds_from": RANGE[0] * seconds, "seconds_to": RANGE[1] * seconds, "bytes": float(size)}

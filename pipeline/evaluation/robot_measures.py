@@ -107,6 +107,7 @@ class RobotTask:
             most_views=self.most_views,
             save=save,
         )
+        hear((name, "surface", 0, 1))
         calibration, rows = save.done("calibration", lambda: _calibration_of(robot, source, truth))
         hear((name, "agreement", 0, 1))
         agreement = save.done("agreement", lambda: _agreement_section(robot, source, truth))

@@ -11,7 +11,7 @@ import numpy as np
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.worker_reports import Hear
+from duagc.pipeline.base.worker_reports import OF_TEAM, Hear
 from duagc.pipeline.evaluation import (
     cameras,
     coverage,
@@ -116,6 +116,7 @@ def evaluate(
     longer, rows = own_longer or {}, list[Row]()
     task = RobotTask(Path(run_dir), Path(recording), threads, progress, most_views, saved)
     of_robots = measured(task, run, source, truth, workers=workers, own_longer=longer, hear=hear)
+    hear((OF_TEAM, "team", 0, 1))
     rendering = rendering_sections({name: m.scores for name, m in of_robots.items()}, longer=bool(longer))
     tree = {
         "schema": METRICS_SCHEMA,
