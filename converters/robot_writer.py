@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.layouts.validity import EVERY, EVERY_NS, MANY, BlackBorder, mask_of_user
+from duagc.converters.layouts.found_regions import FoundRegions
+from duagc.converters.layouts.validity import mask_of_user
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -59,7 +60,7 @@ class RobotWriter:
         depth_scale: float,
         *,
         sensors: Mapping[str, str] | None = None,
-        find_black: bool = True,
+        find_regions: bool = True,
     ) -> None:
         """Initialize.
 
@@ -70,7 +71,8 @@ class RobotWriter:
             depth_scale: meters per unit of the depth images.
             sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's
                 metadata.
-            find_black: leave out large regions at the border that are black in all images, as a vignette is.
+            find_regions: leave out large regions at the border that do not show the scene: black in all images, as a
+                vignette is, or the robot itself.
         """
         if not re.fullmatch(topics.ROBOT_NAME, name):
             raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")
@@ -85,9 +87,8 @@ class RobotWriter:
         self._truth: LogWriter | None = None
         self._has_depth = self._has_exact_depth = self._has_sigma = False
         self._valid = mask_of_user(name, camera.width, camera.height)
-        self._black = BlackBorder() if find_black else None
-        self._black_share = 0.0
-        self._next_look_ns = 0
+        self._regions = FoundRegions() if find_regions else None
+        self._shares: dict[str, float] = {}  # of the pixels that were found to show something else
         # topic of a sensor's pose in the camera that is still to be written
         self._sensors: dict[str, NDArray[np.float64]] = {}
         self._stamps: list[int] = []
@@ -110,12 +111,15 @@ class RobotWriter:
         self._check_size(valid)
         self._valid = valid if self._valid is None else self._valid & valid
 
-    def _leave_out_black(self) -> None:
-        """Write another mask of all images, at the end, where a region at the border was black in all of them."""
-        shown = None if self._black is None or not self._stamps else self._black.result(self._valid)
-        if shown is not None:
-            self._black_share = float(np.mean(~shown))
+    def _leave_out_found(self) -> None:
+        """Write another mask of all images, at the end, where a region was found that does not show the scene."""
+        if self._regions is None or not self._stamps:
+            return
+        found = self._regions.result(self._valid)
+        for name, shown in found.items():
+            self._shares[name] = float(np.mean(~shown))
             self._valid = shown if self._valid is None else self._valid & shown
+        if found:
             self._write_valid(self._stamps[-1])
 
     def _write_valid(self, stamp_ns: int) -> None:
@@ -167,10 +171,8 @@ class RobotWriter:
             self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
             self._write_valid(stamp_ns)
         index = len(self._stamps)
-        due = index % (EVERY if index >= MANY else EVERY // 2) == 0 or stamp_ns >= self._next_look_ns
-        if self._black is not None and due:
-            self._black.add(color)
-            self._next_look_ns = stamp_ns + EVERY_NS
+        if self._regions is not None:
+            self._regions.add(index, stamp_ns, color, depth)
         self._stamps.append(int(stamp_ns))
         self._log.write(
             topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
@@ -355,7 +357,7 @@ class RobotWriter:
     ) -> None:
         try:
             if kind is None:
-                self._leave_out_black()
+                self._leave_out_found()
         except BaseException:
             self._files.__exit__(*sys.exc_info())
             raise
@@ -383,8 +385,7 @@ class RobotWriter:
         }
         if self._valid is not None:
             summary["masked_share"] = float(np.mean(~self._valid))
-        if self._black_share:
-            summary["black_share"] = self._black_share
+        summary |= {f"{name}_share": share for name, share in self._shares.items()}
         if self._truth:
             summary["digests"][self._truth.path.name] = self._truth.digest
         if self._positions:

@@ -46,6 +46,11 @@ SPELLING_ALPHABET = """
     sierra tango uniform victor whiskey xray yankee zulu
 """
 ROBOT_NAMES = tuple(SPELLING_ALPHABET.split())
+FOUND = {
+    "black": "are black in all images",
+    "body": "keep their depth while the camera moves, as what carries it does",
+}
+"""Regions that do not show the scene, by the name that `RobotWriter` gives them."""
 UNITS = {"time": "ns", "length": "m", "depth": "depth_scale_m per unit, along z, 0 = none", "angle": "rad"}
 
 
@@ -103,7 +108,7 @@ class RecordingWriter:
         depth_scale: float,
         sensors: Mapping[str, str] | None = None,
         *,
-        find_black: bool = True,
+        find_regions: bool = True,
     ) -> RobotWriter:
         """The writer of one robot's logs, to be used as a context manager within this one.
 
@@ -112,9 +117,11 @@ class RecordingWriter:
             camera: of color and depth alike.
             depth_scale: meters per unit of the depth images.
             sensors: as of `RobotWriter`.
-            find_black: as of `RobotWriter`.
+            find_regions: as of `RobotWriter`.
         """
-        writer = RobotWriter(self.folder, name, camera, depth_scale, sensors=sensors, find_black=find_black)
+        writer = RobotWriter(
+            self.folder, name, camera, depth_scale, sensors=sensors, find_regions=find_regions
+        )
         self._open.append(writer)
         return writer
 
@@ -128,10 +135,11 @@ class RecordingWriter:
         robot = row.pop("robot")
         if robot in self._robots:
             raise ValueError(f"robot {robot} is in the recording already")
-        if row.get("black_share"):
-            self.warnings.append(
-                f"{robot}: {row['black_share']:.1%} of the pixels, at the border, are black in all images; left out"
-            )
+        for name, words in FOUND.items():
+            if row.get(f"{name}_share"):
+                self.warnings.append(
+                    f"{robot}: {row[f'{name}_share']:.1%} of the pixels, at the border, {words}; left out"
+                )
         self._robots[robot] = row
 
     def add_geometry(self, write: Callable[[Path], None]) -> None:

@@ -55,7 +55,7 @@ def masked(source: Recording, out: Path, seed: int | None) -> Path:
                     messages.unpack_pose_in_frame(record.proto())
                     for record in read_log(truth, [topics.GROUNDTRUTH_POSE.of(name)])
                 ]
-                with recording.robot(name, log.camera, log.depth_scale, find_black=False) as robot:
+                with recording.robot(name, log.camera, log.depth_scale, find_regions=False) as robot:
                     robot.set_valid(body())
                     for frame in log.frames():
                         usable = arm(frame.index) if frame.index % 3 == 1 else None

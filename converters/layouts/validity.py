@@ -25,8 +25,6 @@ BLACK = 8  # of 255: a pixel that is never brighter sees nothing
 BRIGHT = 40  # of 255: an image whose percentile is no brighter cannot tell black pixels from a dark scene
 BRIGHT_PERCENT = 75
 LEAST_IMAGES = 8  # that must tell
-EVERY, EVERY_NS = 8, 250_000_000  # an image of so many is looked at, and one in so long a time
-MANY = 32  # images; of these twice as many are looked at, so that short recordings tell
 LEAST_BLACK = 0.002  # of the pixels, in pieces that touch the border
 GROW_PX = 4  # a vignette does not end from one pixel to the next
 ROUNDING_PX = 1e-4  # of maps that are float32; changes a gray value by less than 0.03
@@ -67,7 +65,7 @@ class BlackBorder:
         self._images = 0
 
     def add(self, data: bytes) -> None:
-        """Take an encoded color image of the recording; those of `EVERY` and `EVERY_NS` do."""
+        """Take an encoded color image of the recording; a few of every second do."""
         import cv2
 
         image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

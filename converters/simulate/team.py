@@ -288,7 +288,7 @@ class _Team:
         for name, path in zip(self.names, self.trajectories, strict=True):
             scale_m = self.scene.depth_scale_m
             # black that was rendered is part of the scene
-            with recording.robot(name, camera, scale_m, sensors, find_black=False) as robot:
+            with recording.robot(name, camera, scale_m, sensors, find_regions=False) as robot:
                 if rig.sensor == "lidar":
                     robot.set_lidar(T_CAMERA_LIDAR, RANGE_SIGMA_M)
                 for i in self._kept[name]:

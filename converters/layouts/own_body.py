@@ -1,0 +1,113 @@
+"""Where a camera sees the robot that carries it: a bumper, a gripper, the frame that it is mounted on."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.geometry.masks import Mask
+
+WIDTH = 160  # columns that are looked at, or up to twice as many
+MOST_IMAGES, LEAST_IMAGES = 64, 8  # that are compared
+STILL, MOVED = (
+    0.03,
+    0.10,
+)  # spread of a pixel's depth over its median: of what moves with the camera, and of the scene
+KNOWN = 0.8  # share of the images in which a pixel of the body has a depth
+STEP = 1.15  # how many times as far what is next to the body is, or it may be a floor that the camera moves along
+NEXT_TO = 5  # pixels of the reduced image
+LEAST_SHARE = 0.005  # of the pixels, in pieces that touch the border
+GROW = 2  # pixels of the reduced image: the outline of what is near is blurred
+Stack = NDArray[np.floating]
+
+
+class OwnBody:
+    """Finds large pieces at the border whose depth stays as it is while that of most pixels changes.
+
+    A floor keeps its depth too, where the camera moves along it. But it goes on where the body has an edge, with the
+    scene some way behind it.
+    """
+
+    def __init__(self) -> None:
+        self._images: list[NDArray[np.uint16]] = []
+        self._shape = (0, 0)
+        self._every = self._seen = 0
+
+    def add(self, depth: NDArray[np.uint16]) -> None:
+        """Take a depth image of the recording; of many, some evenly spread ones are kept.
+
+        Args:
+            depth: [h, w], 0 = none; all in one unit.
+        """
+        if not self._images:
+            self._shape, self._every = depth.shape, 1
+        if depth.shape != self._shape:
+            return
+        self._seen += 1
+        if (self._seen - 1) % self._every:
+            return
+        step = self._step()
+        self._images.append(depth[step // 2 :: step, step // 2 :: step].copy())
+        if len(self._images) == MOST_IMAGES:
+            self._images, self._every = self._images[::2], 2 * self._every
+
+    def _step(self) -> int:
+        return max(1, self._shape[1] // WIDTH)
+
+    def result(self) -> Mask | None:
+        """Pixels that show no body, bool [h, w]; None where none is seen, or the images cannot tell."""
+        from scipy import ndimage
+
+        if len(self._images) < LEAST_IMAGES:
+            return None
+        depth = np.stack(self._images).astype(np.float32)
+        known = (depth > 0).mean(axis=0)
+        low, middle, high = _percentiles(np.where(depth > 0, depth, np.float32(np.nan)))
+        spread = (high - low) / middle
+        often = known > 0.5
+        if not often.any() or np.median(spread[often]) < MOVED:
+            return None  # the camera stood still
+        still = (known >= KNOWN) & (spread < STILL)
+        # the rim that undistortion leaves has no depth
+        labels, _ = ndimage.label(still | (known == 0), np.ones((3, 3)))
+        found = np.zeros_like(still)
+        for label in np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])):
+            piece = still & (labels == label)
+            if np.count_nonzero(piece) >= LEAST_SHARE * still.size:
+                found |= _with_edge(piece, middle)
+        if not found.any():
+            return None
+        grown = ndimage.binary_dilation(found, np.ones((3, 3)), GROW)
+        step = self._step()
+        rows, columns = (
+            np.minimum(np.arange(n) // step, m - 1) for n, m in zip(self._shape, grown.shape, strict=True)
+        )
+        return ~np.asarray(grown[np.ix_(rows, columns)])
+
+
+def _percentiles(depth: Stack) -> Stack:
+    """The 10th, 50th and 90th percentile of every pixel, [3, h, w]; NaN where it never had a depth."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanpercentile(depth, [10, 50, 90], axis=0))
+
+
+def _with_edge(piece: Mask, middle: Stack) -> Mask:
+    """The piece, with what it encloses, if most of what is next to it is farther away; else nothing.
+
+    Args:
+        piece: bool [h, w].
+        middle: [h, w], median depth of every pixel, or NaN.
+    """
+    from scipy import ndimage
+
+    square = np.ones((3, 3))
+    around = ndimage.binary_dilation(piece, square, NEXT_TO) & ~ndimage.binary_dilation(piece, square)
+    around &= np.isfinite(middle)
+    if not around.any():
+        return np.zeros_like(piece)
+    rows, columns = ndimage.distance_transform_edt(~piece, return_distances=False, return_indices=True)
+    steps = middle[around] / middle[rows[around], columns[around]]
+    return ndimage.binary_fill_holes(piece) if np.median(steps) >= STEP else np.zeros_like(piece)
