@@ -278,8 +278,10 @@ class TrackingConfig(Config):
     differs by more than this factor."""
     max_keyframe_gain: float = 1.5
     """A frame brighter or darker than its keyframe by more than this factor, or with a gray residual that would be too
-    large for relocalization, becomes a keyframe only below `relocalization.min_overlap`, and only if little of
-    it is saturated."""
+    large for relocalization, becomes a keyframe only below `relocalization.min_overlap`, or where the exposure drifts,
+    and only if little of it is saturated."""
+    max_gain_step: float = Field(default=1.15, ge=1.0)
+    """Factor up to which two frames in a row are exposed alike: an exposure that drifts does not jump."""
     max_saturated: float = 0.1
     """Share of black and white pixels up to which that is so."""
     failure: FailureConfig = FailureConfig()

@@ -9,6 +9,7 @@ only when the next frame agrees.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -360,6 +361,8 @@ class Tracker:
             state.compare_gyro(frame.stamp_ns, step[:3, :3])
         if not same_keyframe:
             state.last_good = None
+        gain = float(result.exposure[0])
+        state.gain_step, state.gain = gain / state.gain if followed else math.inf, gain
         state.keyframe_index, state.T_keyframe_camera = found.keyframe_index, result.T_reference_target
         state.stamp_ns, state.lost = frame.stamp_ns, False
         state.remember_pose()
@@ -396,7 +399,7 @@ class Tracker:
         return abs(depth_offset_ns) * 1e-9 <= self.state.config.keyframes.max_depth_offset_s
 
     def _is_well_exposed(self, pyramid: RgbdPyramid, result: Registration) -> bool:
-        """Whether a frame looks as its keyframe does, or that must be left and the frame is not burnt out.
+        """Whether a frame looks as its keyframe does; or, hardly saturated, leaves it or drifts from its exposure.
 
         Where the exposure jumps, too dark and too bright images pass. They make poor keyframes.
         """
@@ -404,13 +407,15 @@ class Tracker:
             return True
         tracking = self.state.config.tracking
         leaving = min(result.overlap, result.view) < tracking.relocalization.min_overlap
-        return leaving and saturated_share(pyramid.levels[0]) <= tracking.max_saturated
+        return (leaving or self.state.drifts(result)) and saturated_share(
+            pyramid.levels[0]
+        ) <= tracking.max_saturated
 
     def _promote(self, frame: CurrentFrame, found: PoseCandidate, status: Status) -> TrackedFrame:
         """Make a tracked frame the next keyframe; then anchored to itself, with the information of its tracking."""
         state = self.state
         new = insert_keyframe(state, frame, found)
-        state.keyframe_index, state.T_keyframe_camera = new, np.eye(4)
+        state.keyframe_index, state.T_keyframe_camera, state.gain = new, np.eye(4), 1.0
         state.last_good = LastGoodFrame(frame.pyramid, state.config.tracking.strides, np.eye(4), None)
         tracked = TrackedFrame.by(
             frame.frame_index, frame.stamp_ns, keyframe_index=new, result=found.result, status=status

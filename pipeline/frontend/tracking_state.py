@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -110,6 +111,8 @@ class TrackingState:
         velocity: [6], right tangent per second, of the two frames before; zero after a loss.
         lost: whether the last frame has no pose.
         gray_rms: gray residuals of the last frames that were followed.
+        gain: how much brighter than its keyframe the last frame is.
+        gain_step: how much brighter than the frame before, if both were followed by one keyframe; else infinite.
         depth_color_inconsistent: whether depth and color disagreed, and nothing has resolved it since.
         frames_without_depth: in a row, up to the current one.
         frames_without_color: the same for color.
@@ -132,6 +135,8 @@ class TrackingState:
     velocity: Array = field(default_factory=lambda: np.zeros(6))
     lost: bool = False
     gray_rms: list[float] = field(default_factory=list)
+    gain: float = 1.0
+    gain_step: float = math.inf
     depth_color_inconsistent: bool = False
     frames_without_depth: int = 0
     frames_without_color: int = 0
@@ -329,6 +334,15 @@ class TrackingState:
         """
         largest = self.config.tracking.max_keyframe_gain
         return 1 / largest < result.exposure[0] < largest and result.rms_gray <= self.largest_gray_rms
+
+    def drifts(self, result: Registration) -> bool:
+        """Whether the last frame is exposed as the one before, and its gray values fit as usual.
+
+        Args:
+            result: of its registration.
+        """
+        largest = self.config.tracking.max_gain_step
+        return 1 / largest < self.gain_step < largest and result.rms_gray <= self.largest_gray_rms
 
     def register_color(self, frame: CurrentFrame) -> Registration:
         """Register the color of a frame to the last good frame, which there must be.

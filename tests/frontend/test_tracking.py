@@ -107,6 +107,23 @@ def test_failed_images_are_lost_and_the_camera_is_found_again(spoil) -> None:
     assert ate_rmse_m(truth[seen], positions(tracker, frames)[seen]) < 1e-3
 
 
+def keyframes_of(gains: np.ndarray) -> list[int]:
+    """Frames that become keyframes of a camera that stands for ten frames, and then walks."""
+    tracker = Tracker(CAMERA, CONFIG)
+    for k, gain in enumerate(gains):
+        gray, depth = render(walk(1.5 * max(0, k - 9)))
+        assert tracker.track(k, 33_333_333 * k, gray * np.float32(gain), depth).status is not Status.LOST
+    return [keyframe.frame_index for keyframe in tracker.keyframes]
+
+
+def test_an_exposure_that_drifts_does_not_keep_frames_from_being_keyframes() -> None:
+    steady = keyframes_of(np.ones(20))
+    assert len(steady) > 1
+    assert keyframes_of(np.maximum(0.93 ** np.arange(20), 0.55)) == steady
+    jumping = np.where(np.arange(20) % 2 == 0, 1.0, 0.55)
+    assert all(jumping[k] == 1.0 for k in keyframes_of(jumping))
+
+
 def test_a_moving_object_behind_a_mask_leaves_the_poses_alone() -> None:
     """A box that follows the camera fills two fifths of the view: seen, it drags the pose along; masked, not."""
     usable = np.ones((CAMERA.height, CAMERA.width), bool)
