@@ -21,6 +21,7 @@ from duagc.pipeline.registration.pyramid import RgbdPyramid
 Descriptors = NDArray[np.uint8]
 DIMENSIONS = 128
 REFINEMENT_ROUNDS = 3  # of fitting to the inliers and finding them again
+DARK, DARK_PERCENT = 100, 99  # gray value that one pixel in a hundred of a well exposed image exceeds
 SCALE = 512.0  # RootSIFT entries are at most 1 and mostly below 0.5; larger ones saturate at one byte
 
 
@@ -84,7 +85,7 @@ def extract_from_gray(
     """
     import cv2
 
-    keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(gray, None)
+    keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(brightened(gray), None)
     if not keypoints:
         return Features(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 3), np.float32))
     u, v = np.array([k.pt for k in keypoints], dtype=np.float64).T
@@ -100,6 +101,20 @@ def extract_from_gray(
     z = z[order]
     points = back_project(camera, u[order], v[order], z)
     return Features(root_sift(sift[order]), points.astype(np.float32))
+
+
+def brightened(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image, or two, four, ... times as bright if it is dark: features are found from a fixed contrast on.
+
+    Args:
+        gray: uint8 [h, w].
+    """
+    counts = np.cumsum(np.bincount(gray.ravel(), minlength=256))
+    bright = max(int(np.searchsorted(counts, DARK_PERCENT / 100 * gray.size)), 1)
+    factor = 1
+    while factor * bright <= DARK:
+        factor *= 2
+    return gray if factor == 1 else np.minimum(gray.astype(np.uint16) * factor, 255).astype(np.uint8)
 
 
 def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> Features:
