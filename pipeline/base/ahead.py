@@ -22,8 +22,8 @@ def in_order(
     """Results of all items, in their order; a few are computed ahead of the one that is taken.
 
     What `work` raises is raised in the place of its result; what was begun after it is dropped.
-    Results that nobody takes are dropped without waiting for the threads: the garbage collector may close this iterator
-    inside any allocation, also where the interpreter holds a lock that a thread needs to end.
+    Results that nobody takes are dropped without waiting for the threads, which end soon: the garbage collector may
+    close this iterator inside any allocation, also where the interpreter holds a lock that a thread needs to end.
 
     Args:
         work: done by threads; it must not depend on the order of the items.
@@ -39,5 +39,10 @@ def in_order(
         while waiting:
             yield waiting.popleft().result()
             waiting.extend(pool.submit(work, item) for item in islice(left, 1))
-    finally:
+    except GeneratorExit:
         pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    except BaseException:
+        pool.shutdown(cancel_futures=True)
+        raise
+    pool.shutdown()

@@ -99,6 +99,9 @@ def run_case(reader: Reader, root: Path, number: int) -> Iterator[str]:
             more = sorted(set(_open_files()) - set(open_before))
             if more:
                 kind, text = "failed", f"left open: {more}"
+        for thread in threading.enumerate():
+            if thread is not threading.main_thread():
+                thread.join(timeout=1.0)  # what is about to end is not left
         if threading.active_count() > 1:
             kind, text = "failed", f"left threads: {threading.enumerate()}"
         yield f"{kind} {text}"
