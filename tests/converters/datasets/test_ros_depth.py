@@ -1,0 +1,175 @@
+"""Depth of bags: which images are depth, how it is moved to the color camera, and what is no measurement."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from duagc.converters import registry
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.recording.read import LogFile
+from duagc.pipeline.recording.register_depth import register_depth
+from tests.fixtures.box_room import path, render
+from tests.fixtures.ros_bags import (
+    COLOR,
+    DEPTH,
+    FRAMES,
+    START_NS,
+    STEP_NS,
+    T_COLOR_DEPTH,
+    Ros,
+    scene,
+)
+
+
+def test_depth_that_is_not_moved_is_wrong(tmp_path: Path) -> None:
+    """The extrinsics matter: taken as registered, the depth does not fit."""
+    z = render(DEPTH, path(1)[0] @ T_COLOR_DEPTH)[1].astype(np.float32)
+    _, true = render(COLOR, path(1)[0])
+    moved = register_depth(z, DEPTH, T_COLOR_DEPTH, COLOR)
+    still = register_depth(z, DEPTH, np.eye(4), COLOR)
+
+    def error(depth: np.ndarray) -> float:
+        return float(np.percentile(np.abs(depth - true)[depth > 0], 90))
+
+    assert error(still) > 2 * error(moved)
+    holes = (moved[30:-30, 40:-40] == 0).mean()
+    assert holes < 0.01
+
+
+def test_depth_of_a_lens_is_undistorted_before_it_is_moved(tmp_path: Path) -> None:
+    """A depth camera with distortion of its own gives the depth that one without would give."""
+    r = Ros(1)
+    bags = {}
+    for name, distortion in (("straight", ()), ("bent", (0.2, -0.1, 0.002, 0.001, 0.0))):
+        rows = []
+        for topic, log_ns, message in scene(r):
+            if topic.endswith("depth/camera_info"):
+                message = r.info(START_NS, "_depth", DEPTH, distortion)
+            if topic.endswith("image_rect_raw"):
+                k = sum(t.endswith("image_rect_raw") for t, _, _ in rows)
+                z = render(DEPTH, path(FRAMES)[k] @ T_COLOR_DEPTH, distortion)[1]
+                stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                message = r.image(stamp, "_depth", np.rint(z * 1000).astype(np.uint16), "16UC1")
+                topic = "/camera/depth/image_raw"
+            rows.append((topic, log_ns, message))
+        bags[name] = r.write(tmp_path / name, rows, "plain")
+        registry.convert("ros", bags[name], tmp_path / f"rec_{name}")
+    depths = []
+    for name in bags:
+        with open_rgbd(tmp_path / f"rec_{name}" / "alpha.mcap") as log:
+            depths.append(log.frame(1).depth)
+    both = (depths[0] > 0) & (depths[1] > 0)
+    assert both.mean() > 0.5
+    assert np.percentile(np.abs(depths[0] - depths[1])[both] / depths[0][both], 90) < 0.01
+
+
+def test_infrared_images_are_not_taken_for_depth(tmp_path: Path) -> None:
+    """Of 16UC1 and mono16 the former is depth; depth as JPEG is stated as the reason why there is none."""
+    r = Ros(2)
+    rows = scene(r)
+    infrared = [
+        (
+            t.replace("depth/image_rect_raw", "infra/image_raw"),
+            ns,
+            r.image(ns, "_ir", np.ones((90, 120), np.uint16), "mono16"),
+        )
+        for t, ns, _ in rows
+        if t.endswith("image_rect_raw")
+    ]
+    registry.convert("ros", r.write(tmp_path / "ir", rows + infrared, "mcap"), tmp_path / "rec")
+    sensors = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["alpha"]["sensors"]
+    assert sensors["depth_topic"] == "/camera/depth/image_rect_raw"
+    jpeg = cv2.imencode(".jpg", np.full((90, 120), 30, np.uint8))[1].tobytes()
+    lost = [
+        (f"{t}/compressed", ns, r.compressed(ns, "_depth", jpeg, "16UC1; jpeg compressed "))
+        if t.endswith("image_rect_raw")
+        else (t, ns, message)
+        for t, ns, message in rows
+    ]
+    with pytest.raises(
+        DuagError, match="image_rect_raw/compressed holds no depth, or as JPEG, which destroys it"
+    ):
+        registry.convert("ros", r.write(tmp_path / "lost", lost, "mcap"), tmp_path / "rec2")
+
+
+def test_depth_that_is_too_far_is_told(tmp_path: Path) -> None:
+    """Registered depth is kept in half millimeters, up to 32.8 m; what lies beyond is left out, and counted."""
+    r = Ros(2)
+    rows = []
+    for topic, log_ns, message in scene(r):
+        if topic.endswith("image_rect_raw"):
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            pixels = np.full((90, 120), 3.0, np.float32)
+            pixels[:45] = 40.0
+            message = r.image(stamp, "_depth", pixels, "32FC1")
+        rows.append((topic, log_ns, message))
+    registry.convert("ros", r.write(tmp_path / "bag", rows, "sqlite3"), tmp_path / "rec")
+    warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
+    assert any("pixels are farther away than 32.8 m" in warning for warning in warnings)
+
+
+def test_color_without_depth_is_kept_to_be_followed(tmp_path: Path) -> None:
+    """Depth comes with the first image only: the last one is 150 ms away from it, beyond what can be moved."""
+    r = Ros(2)
+    late = START_NS + STEP_NS + 20_000_000
+    rows = [row for row in scene(r) if "/depth/image" not in row[0] or row[1] < late]
+    bag = r.write(tmp_path / "bag", rows, "mcap")
+    for option, kept, end in (("all", FRAMES, "followed by color"), ("official", 1, "left out")):
+        registry.convert("ros", bag, tmp_path / option, options=["truth=/odom", f"association={option}"])
+        with open_rgbd(tmp_path / option / "alpha.mcap") as log:
+            assert len(log) == kept
+            assert log.frame(0).depth.any()
+            assert kept == 1 or not log.frame(FRAMES - 1).depth.any()
+        warnings = json.loads((tmp_path / option / "recording.json").read_text())["warnings"]
+        assert any(text.endswith(end) for text in warnings)
+
+
+@pytest.mark.parametrize(("options", "left"), [([], 0), (["farthest_m=4"], 0), (["farthest_m=30"], 20_000)])
+def test_the_greatest_distance_is_no_measurement(tmp_path: Path, options: list[str], left: int) -> None:
+    r = Ros(2)
+    rows = []
+    for topic, log_ns, message in scene(r):
+        if "/depth/image" in topic:
+            z = render(DEPTH, path(FRAMES)[0])[1]
+            units = np.rint(1000 * z).astype(np.uint16)
+            units[:, :40] = 20_000
+            message = r.image(log_ns, "_depth", units, "16UC1")
+        rows.append((topic, log_ns, message))
+    bag = r.write(tmp_path / "bag", rows, "mcap")
+    registry.convert("ros", bag, tmp_path / "rec", options=options)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        depth_m = log.frame(0).depth
+        assert depth_m.max() == pytest.approx(left / 1000, rel=0.01) if left else 1.0 < depth_m.max() < 10.0
+        assert (depth_m > 0).mean() > 0.3
+    warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
+    assert any("is exactly 20.000 m" in text for text in warnings) == (not options)
+
+
+def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
+    """To the last bit, in any unit, and beyond 32 m."""
+    r = Ros(2)
+    rng = np.random.default_rng(5)
+    pixels = rng.integers(0, 65536, (FRAMES, 120, 160)).astype(np.uint16)
+    rows, k = [], 0
+    for topic, log_ns, message in scene(r):
+        if topic.endswith("camera_info"):
+            message = r.info(START_NS, "_color", COLOR)
+        elif topic.endswith("image_rect_raw"):
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            message, k = r.image(stamp, "_color", pixels[k], "16UC1", pad=6, big=k == 2), k + 1
+        rows.append((topic, log_ns, message))
+    bag = r.write(tmp_path / "bag", rows, "sqlite3")
+    registry.convert("ros", bag, tmp_path / "rec", options=["depth_scale=0.00025"])
+    with LogFile(tmp_path / "rec" / "alpha.mcap") as log:
+        records = list(log.records(["/alpha/camera/depth"]))
+    assert log.channels["/alpha/camera/depth"].metadata["depth_scale"] == "0.00025"
+    assert all(
+        np.array_equal(m.unpack_depth(record.proto(), "here"), pixels[i]) for i, record in enumerate(records)
+    )
