@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -16,8 +17,9 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages import GaussianInformation
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.runs.keyframe_images import Images
-from duagc.pipeline.runs.robot_data import RobotData
+from duagc.pipeline.runs.robot_data import RobotData, SessionResult
 from duagc.pipeline.splat.gaussians import Gaussians
+from tests.exchange.meeting import NAMES, Team, meet
 
 MakeRobot = Callable[..., tuple[RobotData, Array]]
 CAMERA = PinholeCamera(240, 180, 200.0, 200.0, 119.5, 89.5)
@@ -127,3 +129,16 @@ def information_of(name: str, maps: Gaussians, rng: np.random.Generator) -> Gaus
 def make_robot() -> MakeRobot:
     """Gives `robot`: name, first viewing direction (rad), number of keyframes and of Gaussians."""
     return robot
+
+
+@pytest.fixture(scope="session")
+def team(make_robot: MakeRobot) -> Team:
+    """Three robots; the map of the last was made with another depth."""
+    robots = {name: make_robot(name, 0.6 * i, keyframes=4) for i, name in enumerate(NAMES)}
+    data, T_true = robots["charlie"]
+    return robots | {"charlie": (replace(data, depth="ray_plane"), T_true)}
+
+
+@pytest.fixture(scope="session")
+def undisturbed(team: Team, tmp_path_factory: pytest.TempPathFactory) -> dict[str, SessionResult]:
+    return meet(team, 2, tmp_path_factory.mktemp("undisturbed"))
