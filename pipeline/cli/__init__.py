@@ -9,6 +9,7 @@ from duagc.pipeline.cli.common import EXIT_FAILED, app
 
 # each registers its commands, and `--help` lists them in this order
 # isort: off
+from duagc.pipeline.cli import new_recordings
 from duagc.pipeline.cli import recordings
 from duagc.pipeline.cli import runs
 from duagc.pipeline.cli import batch
@@ -31,6 +32,7 @@ __all__ = [
     "experiment",
     "inspect",
     "main",
+    "new_recordings",
     "posegraph",
     "recordings",
     "robustness",
