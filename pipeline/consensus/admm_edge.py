@@ -10,15 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.config.consensus import LoopClosureConfig
+from duagc.pipeline.config.consensus import LoopClosureConfig, PoseConsensusConfig
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.posegraph.gnc import RobustWeights
+from duagc.pipeline.posegraph.least_squares import difference, retract
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
 STEP_M = 2.0**-27
 """Steps of translations on the wire `fixed`: 7.5 nm."""
 BLOCK = [0, 0, 0, 1, 1, 1]
 """Translation, rotation -> the six rows of a tangent."""
+STEADY = 1e-3
+"""Largest change of a link past its initial transient (m, rad)."""
 REMEMBERED = 8
 """Arrivals that must have changed little before an end has converged."""
 
@@ -105,6 +108,55 @@ class AdmmEdge:
         self.changes = np.full((len(self.keyframes), REMEMBERED), np.inf)
         self.active = np.ones(len(self.keyframes), dtype=bool)
 
+    @classmethod
+    def begin(
+        cls,
+        peer: str,
+        shared: SharedKeyframes,
+        closures: tuple[LoopClosure, ...],
+        kept: NDArray[np.bool_],
+        *,
+        decides: bool,
+        config: PoseConsensusConfig,
+    ) -> AdmmEdge:
+        """An end before the first step.
+
+        Args:
+            peer: name of the other robot.
+            shared: keyframes that both ends have.
+            closures: that this end holds; none at the other end.
+            kept: bool per loop closure, start of the robust weights.
+            decides: whether this end decides on penalties.
+            config: the same at all robots.
+        """
+        return cls(
+            peer=peer,
+            decides=decides,
+            keyframes=np.asarray(shared.keyframes, dtype=np.int32),
+            metric=np.asarray(shared.metric, dtype=np.float64),
+            slots=np.asarray(shared.keyframes, dtype=np.int64),
+            closures=closures,
+            factors=RelativePoses.empty(),
+            robust=RobustWeights(kept.astype(np.float64), config, first_mu=config.team_schedule().first_mu),
+            penalties=np.full(2, np.float64(np.float32(config.penalty_start))),
+        )
+
+    def lay_out(self, first: int, config: LoopClosureConfig) -> RelativePoses:
+        """Place the copies of the shared keyframes among the variables of the robot that holds the loop closures.
+
+        Args:
+            first: index of the first copy.
+            config: floors of the covariances.
+
+        Returns:
+            The loop closures as factors between these variables.
+        """
+        self.slots = first + np.arange(len(self.keyframes))
+        own = [c.own_keyframe for c in self.closures]
+        copy = self.slots[np.searchsorted(self.keyframes, [c.peer_keyframe for c in self.closures])]
+        self.factors = closures_as_relative_poses(self.closures, own, copy, config)
+        return self.factors
+
     @property
     def holds(self) -> bool:
         """Whether this end has the loop closures of the pair."""
@@ -118,8 +170,40 @@ class AdmmEdge:
         """W (x - y) [s, 6]: the multiplier of this end (dual)."""
         return self.penalty() * self.offset
 
-    def moved(self, at: NDArray[np.int64], change: Array) -> None:
-        """Note by how much an arrival moved the edge variables `at` (m, rad)."""
+    def take_header(self, packet: PosePacket) -> None:
+        """Take what a packet says besides poses, unless a later one said it already.
+
+        Args:
+            packet: of the present version.
+        """
+        if packet.sequence >= self.newest_header:
+            self.newest_header, self.peer_converged = packet.sequence, packet.converged
+            if packet.curvature is not None:
+                self.peer_curvature = packet.curvature.astype(np.float64)
+
+    def places_of(self, packet: PosePacket) -> NDArray[np.int64] | None:
+        """Places of a packet's keyframes among the shared ones; None if it has others.
+
+        Args:
+            packet: of the peer.
+        """
+        at = np.searchsorted(self.keyframes, packet.keyframes)
+        shared = self.keyframes[np.minimum(at, len(self.keyframes) - 1)]
+        return at if np.array_equal(shared, packet.keyframes) else None
+
+    def relax(self, at: NDArray[np.int64], m: Array, x: Array, relaxation: float) -> None:
+        """y <- y + relaxation (m - y), as a change of the offsets.
+
+        Args:
+            at: [k], places of the keyframes that arrived.
+            m: [k, 4, 4], their poses as they were sent.
+            x: [k, 4, 4], as this robot has them.
+            relaxation: of the iteration.
+        """
+        y = retract(x, -self.offset[at])
+        delta = relaxation * difference(m, y)
+        self.offset[at] -= delta
+        change = np.abs(delta).max(axis=1)
         self.changes[at] = np.concatenate([self.changes[at, 1:], change[:, None]], axis=1)
 
     def largest_change(self) -> float:
@@ -146,6 +230,14 @@ class AdmmEdge:
         named = np.array([c.peer_keyframe for c in self.closures], dtype=np.int64)
         carrying[np.searchsorted(self.keyframes, named[self.robust.weights > 0])] = True
         return carrying
+
+    def is_steady(self, period: int) -> bool:
+        """Whether the link is past its initial transient.
+
+        Args:
+            period: packets that must have arrived.
+        """
+        return self.received_total >= period and self.largest_change() < STEADY
 
     def largest_recent_change(self) -> float:
         """The same over the last arrivals; infinite before there were so many.

@@ -21,7 +21,8 @@ Penalties are agreed between the two ends of a link: `admm_penalties`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,14 +39,13 @@ from duagc.pipeline.consensus.admm_edge import (
     rounded,
     start_of_copies,
 )
+from duagc.pipeline.consensus.local_problem import LocalProblem
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, RobustWeights
-from duagc.pipeline.posegraph.least_squares import difference, retract
-from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
-
-_STEADY = 1e-3  # m, rad: a link that moves less is past its initial transient
+from duagc.pipeline.posegraph.least_squares import retract
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
 
 
 class PoseAgent:
@@ -83,17 +83,14 @@ class PoseAgent:
         self.loop_weights = RobustWeights(kept, config)
         self.T_world_map = np.eye(4)
         self.links: dict[str, AdmmEdge] = {}
-        self.rounds = self.factorizations = 0
         self.step_change = np.inf
         self._copies_start: dict[str, Array] = {}
         self._started = False
         self.masks: dict[str, tuple[int, NDArray[np.bool_]]] = {}  # by neighbor, to be sent
         self._adapts = False  # the weights have had their schedule
         self._x = self.T_map_keyframe.copy()
-        self._factors = RelativePoses.concatenate([self.odometry, self.loops])
+        self._problem = LocalProblem(RelativePoses.concatenate([self.odometry, self.loops]), config)
         self._collect_weights()
-        self._solve: Callable[[Array], Array] | None = None
-        self._moved_rad = 0.0
         self._dual_change = 0.0
 
     # ---- set-up ----
@@ -140,62 +137,38 @@ class PoseAgent:
             shared = SharedKeyframes(
                 keyframes.astype(np.int32), link_metric(closures, keyframes, self.config.closures)
             )
-            known = self._in_map(T_world_keyframe_peer or {})
+            T_map_world = se3.inverse(self.T_world_map)
+            known = {k: T_map_world @ np.asarray(T) for k, T in (T_world_keyframe_peer or {}).items()}
             self._copies_start[peer] = start_of_copies(
                 closures, kept, keyframes, self.T_map_keyframe, known=known
             )
-        self.links[peer] = AdmmEdge(
-            peer=peer,
-            decides=self.robot < peer,
-            keyframes=np.asarray(shared.keyframes, dtype=np.int32),
-            metric=np.asarray(shared.metric, dtype=np.float64),
-            slots=np.asarray(shared.keyframes, dtype=np.int64),
-            closures=closures,
-            factors=RelativePoses.empty(),
-            robust=RobustWeights(
-                kept.astype(np.float64), self.config, first_mu=self.config.team_schedule().first_mu
-            ),
-            penalties=np.full(2, np.float64(np.float32(self.config.penalty_start))),
+        self.links[peer] = AdmmEdge.begin(
+            peer, shared, closures, kept, decides=self.robot < peer, config=self.config
         )
         self.links = {name: self.links[name] for name in sorted(self.links)}
         return shared
 
-    def _in_map(self, T_world: Mapping[int, ArrayLike]) -> dict[int, Array]:
-        T_map_world = se3.inverse(self.T_world_map)
-        return {k: T_map_world @ np.asarray(T, dtype=np.float64) for k, T in T_world.items()}
-
     def _start(self) -> None:
         """Lay out the variables: own keyframes, then copies by neighbor; factors over all of them."""
         self._started = True
-        poses, parts, count = [self.T_map_keyframe], [self._factors], len(self.T_map_keyframe)
+        poses, parts, count = [self.T_map_keyframe], list[RelativePoses](), len(self.T_map_keyframe)
         for link in self.links.values():
             if link.holds:
-                copies = self._copies_start[link.peer]
-                link.slots = count + np.arange(len(copies))
-                poses.append(copies)
-                own = [c.own_keyframe for c in link.closures]
-                copy = link.slots[np.searchsorted(link.keyframes, [c.peer_keyframe for c in link.closures])]
-                link.factors = closures_as_relative_poses(link.closures, own, copy, self.config.closures)
-                parts.append(link.factors)
-                count += len(copies)
+                poses.append(self._copies_start[link.peer])
+                parts.append(link.lay_out(count, self.config.closures))
+                count += len(link.keyframes)
         self._x = self.T_world_map @ np.concatenate(poses)
-        self._factors = RelativePoses.concatenate(parts)
+        self._problem.extend(parts)
         self._collect_weights()
 
     def _collect_weights(self) -> None:
         held = [link.robust.weights for link in self.links.values() if link.holds]
-        weights = np.concatenate([np.ones(len(self.odometry)), self.loop_weights.weights, *held])
-        counts = weights != 0.0  # the others would only fill the factorization
-        everything = bool(counts.all()) or not self.config.team_schedule().drop_idle
-        self._counted = self._factors if everything else self._factors.select(counts)
-        self._weights = weights if everything else weights[counts]
-        self._solve = None
+        self._problem.weigh(np.concatenate([np.ones(len(self.odometry)), self.loop_weights.weights, *held]))
 
     # ---- one round ----
 
     def step(self) -> float:
         """One Gauss-Newton step; returns its largest component (m, rad). Without links nothing moves."""
-        self.rounds += 1
         if not self.links:
             self.step_change = 0.0
             return 0.0
@@ -205,31 +178,16 @@ class PoseAgent:
         for link in self.links.values():
             self._weigh(link)
             self._decide(link)
-        force_before = {peer: link.force() for peer, link in self.links.items()}
-        g, jacobians = least_squares.gradient(self._counted, self._weights, self._x)
-        for peer, link in self.links.items():
-            g[link.slots] += force_before[peer]
-        if self._solve is None or self._moved_rad > self.config.relinearize_rad:
-            diagonal = np.zeros_like(g)
-            for link in self.links.values():
-                diagonal[link.slots] += link.penalty()
-            stiffest = diagonal.max() or max(float(link.metric.max()) for link in self.links.values())
-            diagonal += 1e-9 * stiffest  # a variable without any factor stays where it is
-            H = least_squares.curvature_matrix(self._counted, jacobians, diagonal)
-            self._solve, self._moved_rad = least_squares.factorized(H), 0.0
-            self.factorizations += 1
-        delta = -self._solve(g.ravel()).reshape(-1, 6)
-        turn_rad = float(np.linalg.norm(delta[:, 3:], axis=1).max())
-        if turn_rad > self.config.step_limit_rad:
-            delta *= self.config.step_limit_rad / turn_rad
+        links = list(self.links.values())
+        before = [link.force() for link in links]
+        delta = self._problem.newton_step(self._x, links, before)
         self._x = retract(self._x, delta)
-        for link in self.links.values():
+        for link in links:
             link.offset = link.offset + delta[link.slots]
-        self._moved_rad += float(np.abs(delta[:, 3:]).max())
         self.step_change = float(np.abs(delta).max())
         self._dual_change = max(
-            float(np.abs((link.force() - force_before[peer]) / np.sqrt(link.metric)).max())
-            for peer, link in self.links.items()
+            float(np.abs((link.force() - force) / np.sqrt(link.metric)).max())
+            for link, force in zip(links, before, strict=True)
         )
         return self.step_change
 
@@ -261,12 +219,9 @@ class PoseAgent:
             self._change_penalties(link, packet.penalties.astype(np.float64), packet.version)
         if packet.version != link.version:
             return False
-        if packet.sequence >= link.newest_header:
-            link.newest_header, link.peer_converged = packet.sequence, packet.converged
-            if packet.curvature is not None:
-                link.peer_curvature = packet.curvature.astype(np.float64)
-        at = np.searchsorted(link.keyframes, packet.keyframes)
-        if not np.array_equal(link.keyframes[np.minimum(at, len(link.keyframes) - 1)], packet.keyframes):
+        link.take_header(packet)
+        at = link.places_of(packet)
+        if at is None:
             raise ValueError(f"{self.robot}: {peer} sent keyframes that the link does not share")
         newer = packet.sequence > link.newest[at]
         if not newer.any():
@@ -281,11 +236,8 @@ class PoseAgent:
                 self._x[link.slots[at[~active]]] = m[~active]
             link.newest[at[~active]] = packet.sequence
             at, m = at[active], m[active]
-        y = retract(self._x[link.slots[at]], -link.offset[at])
-        delta = self.config.relaxation * difference(m, y)
-        link.offset[at] -= delta
+        link.relax(at, m, self._x[link.slots[at]], self.config.relaxation)
         link.newest[at] = packet.sequence
-        link.moved(at, np.abs(delta).max(axis=1))
         share = int(newer.sum()) / len(link.keyframes)
         link.received += share
         link.received_total += share
@@ -308,17 +260,14 @@ class PoseAgent:
 
     def _change_penalties(self, link: AdmmEdge, penalties: Array, version: int) -> None:
         admm_penalties.change(link, penalties, version, self._x[link.slots])
-        self._solve = None
+        self._problem.refactorize()
 
     # ---- robust weights of held loop closures ----
 
     def _weigh(self, link: AdmmEdge) -> None:
         """Robust weights of a link's loop closures, paced by what arrives on it."""
-
-        def squared() -> Array:
-            return least_squares.squared_residuals(link.factors, self._x)
-
-        if link.robust.advance(link.received_total, self._steady(link), squared):
+        squared = partial(least_squares.squared_residuals, link.factors, self._x)
+        if link.robust.advance(link.received_total, link.is_steady(self.config.penalty_period), squared):
             self._reweighted()
             if link.robust.scheduled:
                 link.reference, link.received = None, 0.0
@@ -326,12 +275,10 @@ class PoseAgent:
     def _weigh_loops(self) -> None:
         """Robust weights of own loops, paced by the link on which least arrives."""
         links = self.links.values()
-
-        def squared() -> Array:
-            return least_squares.squared_residuals(self.loops, self._x)
-
+        squared = partial(least_squares.squared_residuals, self.loops, self._x)
         received = min(link.received_total for link in links)
-        if self.loop_weights.advance(received, all(self._steady(link) for link in links), squared):
+        steady = all(link.is_steady(self.config.penalty_period) for link in links)
+        if self.loop_weights.advance(received, steady, squared):
             self._reweighted()
 
     def _reweighted(self) -> None:
@@ -372,11 +319,7 @@ class PoseAgent:
         if link.holds or len(active) != len(link.keyframes):
             raise ValueError("mask: not from a holder of loop closures, or not of its keyframes")
         link.activate(active, version)
-        self._solve = None
-
-    def _steady(self, link: AdmmEdge) -> bool:
-        """Whether a link is past its initial transient."""
-        return link.received_total >= self.config.penalty_period and link.largest_change() < _STEADY
+        self._problem.refactorize()
 
     @property
     def _scheduled(self) -> bool:
@@ -439,14 +382,14 @@ class PoseAgent:
         return {
             "primal": max(changes, default=0.0) / self.config.relaxation,
             "dual": self._dual_change,
-            "cost": least_squares.cost(self._counted, self._x, self._weights) if self._started else 0.0,
+            "cost": self._problem.cost(self._x) if self._started else 0.0,
             "step": self.step_change,
             "penalties": {peer: tuple(link.penalties.tolist()) for peer, link in self.links.items()},
             "versions": {peer: link.version for peer, link in self.links.items()},
             "weights": {
                 peer: link.robust.weights.tolist() for peer, link in self.links.items() if link.holds
             },
-            "factorizations": self.factorizations,
+            "factorizations": self._problem.factorizations,
         }
 
 
