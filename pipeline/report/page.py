@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,15 @@ from duagc.pipeline.base.templates import filled
 from duagc.pipeline.evaluation.cameras import CHANNELS
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import Path3, paths, top_view_axes
-from duagc.pipeline.evaluation.results import Absent, reason_of
+from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import figures, labels, pictures
+from duagc.pipeline.report.cards import cards
 from duagc.pipeline.report.coverage import coverage_content
 from duagc.pipeline.report.renders import rendered_views
 from duagc.pipeline.runs.folder import RunFolder
 
 TEMPLATE = "page.html.j2"
-TEAM_ONLY = ("team.ate_rmse_m", "rendering.fused.peers.psnr_db", "rendering.refined.peers.psnr_db")
-"""Values that a run of one robot cannot have: it shows no card for them."""
-
 EXPOSURE_NOTE = (
     "A view is drawn in the exposure that the robot found of the mapped frames before and after it, if it found any. "
     "Nothing is fitted to a view, but where a column says so: there each half of a view is compared in the exposure "
@@ -80,7 +78,7 @@ def content(run: RunFolder, source: Recording, workers: int) -> dict[str, Any]:
         "title": f"{source.name}: {_count(len(run.robots), 'robot')}",
         "subtitle": _subtitle(metrics),
         "sections": SECTIONS,
-        "cards": _cards(metrics, reasons),
+        "cards": cards(metrics, reasons),
         **_paths_content(run, source, metrics),
         **coverage_content(run, metrics),
         "comparison_sets": [labels.VIEW_SETS[s] for s in labels.compared_sets(metrics)],
@@ -164,60 +162,6 @@ def _known(metrics: dict[str, Any]) -> str:
     return {"unknown": "unknown at the start", "given": "given at the start"}[
         metrics["protocol"]["initial_relative_poses"]
     ]
-
-
-def _in_exposure(
-    path: str, scores: Mapping[str, Any], meaning: Callable[[str, str, str], str]
-) -> list[tuple[str, str, str]]:
-    """The card of PSNR in the exposure of the view, where frames are not all exposed alike."""
-    name = "psnr_interpolated_db"
-    if scores[name] == scores["psnr_db"]:
-        return []
-    return [(f"{path}.{name}", "PSNR, in exposure", meaning("held_out", name, "in the exposure of the view"))]
-
-
-def _cards(metrics: dict[str, Any], reasons: dict[str, list[str]]) -> list[dict[str, str]]:
-    """The few numbers to look at first."""
-    own = metrics["rendering"]["own"]
-    final = "fused" if metrics["rendering"]["refined"]["held_out"]["psnr_db"] is None else "refined"
-
-    def meaning(view_set: str, name: str, what: str) -> str:
-        return f"{final} maps, {what}; own maps: {labels.text(name, own[view_set][name])}"
-
-    held_out, peers = f"rendering.{final}.held_out", f"rendering.{final}.peers"
-    chosen = (
-        ("team.ate_rmse_m", *labels.TEAM["ate_rmse_m"]),
-        ("team.ate_rmse_m_mean_of_robots", *labels.TEAM["ate_rmse_m_mean_of_robots"]),
-        (f"{held_out}.psnr_db", "PSNR", meaning("held_out", "psnr_db", "views never mapped")),
-        *_in_exposure(held_out, metrics["rendering"][final]["held_out"], meaning),
-        (f"{peers}.psnr_db", "PSNR, peers' views", meaning("peers", "psnr_db", "where the others stood")),
-        (
-            f"{held_out}.depth_l1_common_m",
-            "Depth L1",
-            meaning("held_out", "depth_l1_common_m", "views never mapped, pixels that all maps cover"),
-        ),
-        ("team.inter_robot_loop_closures", *labels.TEAM["inter_robot_loop_closures"]),
-        ("exchange.bytes_sent", *labels.EXCHANGE["bytes_sent"]),
-        ("exchange.rounds", *labels.EXCHANGE["rounds"]),
-    )
-    alone = len(metrics["robots"]) < 2
-    cards = []
-    for path, label, what in chosen:
-        value: Any = metrics
-        for part in path.split("."):
-            value = value[part]
-        if value is None and alone and path in TEAM_ONLY:
-            continue
-        name = path.rsplit(".", 1)[1]
-        cards.append(
-            {
-                "label": label,
-                "value": labels.text(name, value),
-                "meaning": what,
-                "reason": reason_of(reasons, path) if value is None else "",
-            }
-        )
-    return cards
 
 
 # --- paths -------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.report import figures, labels, pictures, write_report
-from duagc.pipeline.report.page import _cards
+from duagc.pipeline.report.cards import cards
 from duagc.pipeline.report.renders import sigma_colors
 from tests.fixtures.fake_run import make
 
@@ -39,13 +39,13 @@ def test_the_page_is_the_same_every_time(fake, html):
 
 def test_psnr_in_the_exposure_of_a_view_has_a_card_where_exposures_differ(fake):
     metrics = json.loads((fake.run / "metrics.json").read_text())
-    labels_of = [card["label"] for card in _cards(metrics, {})]
+    labels_of = [card["label"] for card in cards(metrics, {})]
     assert "PSNR" in labels_of
     assert "PSNR, in exposure" not in labels_of
     for kind in ("own", "fused", "refined"):
         scores = metrics["rendering"][kind]["held_out"]
         scores["psnr_interpolated_db"] = None if scores["psnr_db"] is None else scores["psnr_db"] + 2.5
-    assert "PSNR, in exposure" in [card["label"] for card in _cards(metrics, {})]
+    assert "PSNR, in exposure" in [card["label"] for card in cards(metrics, {})]
 
 
 def test_the_page_shows_numbers_with_units_pictures_and_reasons(html):
