@@ -54,7 +54,10 @@ ABLATION: dict[str, dict[str, Any]] = {
     "no loops": {"keyframes.loops.enabled": False},
     "neither": {"keyframes.local_optimization": False, "keyframes.loops.enabled": False},
 }
-FRAME_PARTS = {"pyramid": ("tracking.RgbdPyramid", "build"), "registration": ("tracking", "register")}
+FRAME_PARTS = {
+    "pyramid": ("tracking.RgbdPyramid", "build"),
+    "registration": ("nearby", "register"),
+}
 KEYFRAME_PARTS = {"seeding": ("mapping.Mapper", "_seed"), "optimization": ("mapping.Mapper", "_optimize")}
 COUNTED = {
     "frame": ("submaps.SubmapTracker", "track"),
@@ -166,7 +169,14 @@ def changed(config: FrontendConfig, values: Mapping[str, Any]) -> FrontendConfig
 
 
 def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str]]:
-    from duagc.pipeline.frontend import mapping, model_registration, pose_optimization, submaps, tracking
+    from duagc.pipeline.frontend import (
+        mapping,
+        model_registration,
+        nearby_registration,
+        pose_optimization,
+        submaps,
+        tracking,
+    )
     from duagc.pipeline.kernels import alignment
 
     modules: dict[str, ModuleType] = {
@@ -174,6 +184,7 @@ def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str
         "poses": pose_optimization,
         "submaps": submaps,
         "tracking": tracking,
+        "nearby": nearby_registration,
         "model": model_registration,
         "alignment": alignment,
     }
@@ -269,7 +280,9 @@ def measure_open3d(log: Path, method: str) -> dict[str, Any]:
     It starts from the motion before, as the tracker does: from rest it is worse.
 
     Args:
+        log: of one robot.
         method: "Hybrid" or "PointToPlane".
+
     Returns:
         Times, peak memory, stamps_ns and poses T_first_camera [n, 4, 4]; `failed` frames keep the pose before.
     """

@@ -5,7 +5,7 @@ A place counts only when later frames are tracked from there: one image can be m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from duagc.pipeline.base import random_streams
@@ -13,6 +13,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
+from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.pose_checks import PLAUSIBLE, verify
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
@@ -70,21 +71,18 @@ class Relocalizer:
         """Forget the place that waits for confirmation."""
         self._unconfirmed = None
 
-    def locate(
-        self, state: TrackingState, frame: CurrentFrame, register_nearby: Callable[[], PoseCandidate | Reason]
-    ) -> PoseCandidate | Reason:
+    def locate(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason:
         """Where a frame is, or why that is not known.
 
         Args:
             state: what the tracker knows.
             frame: the current frame.
-            register_nearby: looks where the camera was last.
         """
         if self._unconfirmed is not None:
             confirmed = self._confirm(state, frame)
             if confirmed is not None:
                 return confirmed
-        nearby = register_nearby()
+        nearby = register_nearby(state, frame)
         place = nearby if isinstance(nearby, PoseCandidate) else find_place(state, frame)
         if place is None:
             return nearby if isinstance(nearby, Reason) else Reason.UNCONFIRMED

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,26 +17,13 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.frontend.color_only import LastGoodFrame
-from duagc.pipeline.frontend.failure import (
-    Reason,
-    has_enough_depth,
-    saturated_share,
-    shows_anything,
-)
-from duagc.pipeline.frontend.feature_initialization import initial_motions
+from duagc.pipeline.frontend.failure import Reason, saturated_share
 from duagc.pipeline.frontend.frame_images import Image, RgbdImages
 from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
 from duagc.pipeline.frontend.keyframe_insertion import insert_first_keyframe, insert_keyframe
-from duagc.pipeline.frontend.pose_checks import (
-    FOLLOWED,
-    FOUND_BY_FEATURES,
-    FOUND_NEARBY,
-    PLAUSIBLE,
-    PoseCheck,
-    verify,
-)
+from duagc.pipeline.frontend.missing_images import follow_by_color, follow_by_depth, missing_image
+from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.relocalization import Relocalizer
-from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
@@ -46,7 +32,7 @@ from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import MotionPrior
 from duagc.pipeline.recording.depth_sources import DepthImage
 from duagc.pipeline.recording.moved_depth import move_depth
-from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
+from duagc.pipeline.registration import Reference, Registration, RgbdPyramid
 
 
 class Tracker:
@@ -158,7 +144,7 @@ class Tracker:
         state = self.state
         state.intervals.update(frame.stamp_ns)
         state.lost = state.lost or state.is_after_gap(frame.stamp_ns)
-        missing = self._missing_image(frame)
+        missing = missing_image(state, frame)
         if missing is Reason.NONE and not state.keyframes:
             return self._initialize(frame)
         found = self._locate(frame, missing)
@@ -174,121 +160,12 @@ class Tracker:
         if missing is Reason.NO_PIXEL:
             return missing
         if missing is Reason.FROZEN_COLOR:
-            return self._follow_by_depth(frame)
+            return follow_by_depth(self.state, frame)
         if missing is not Reason.NONE:
-            return self._follow_by_color(frame, missing)
+            return follow_by_color(self.state, frame, missing)
         if not self.state.is_long_lost(frame.stamp_ns):
-            return self._register_nearby(frame)
-        return self._relocalizer.locate(self.state, frame, lambda: self._register_nearby(frame))
-
-    # --- which images can be used ---------------------------------------------------------------------------------
-
-    def _missing_image(self, frame: CurrentFrame) -> Reason:
-        """NO_PIXEL, FROZEN_COLOR, FROZEN_DEPTH, NO_DEPTH or NONE; counts the frames in a row."""
-        state = self.state
-        if not shows_anything(frame.pyramid, state.config.tracking.failure):
-            return Reason.NO_PIXEL
-        frozen = state.frozen.update(frame.pyramid)
-        if frozen is Reason.FROZEN_COLOR:
-            state.frames_without_color += 1
-            return frozen
-        state.frames_without_color = 0
-        enough = has_enough_depth(frame.pyramid, state.config.tracking.registration)
-        missing = frozen if enough else Reason.NO_DEPTH
-        state.frames_without_depth = 0 if missing is Reason.NONE else state.frames_without_depth + 1
-        return missing
-
-    def _follow_by_color(self, frame: CurrentFrame, missing: Reason) -> PoseCandidate | Reason:
-        """Follow a frame without depth by its color alone, for a while, if it looks as frames did before."""
-        state, failure = self.state, self.state.config.tracking.failure
-        too_many = state.frames_without_depth > failure.max_frames_without_depth
-        if too_many or state.lost or state.occlusion.active or state.last_good is None:
-            return missing
-        result = state.register_color(frame)
-        followed = result.ok and state.looks_as_usual(result)
-        return PoseCandidate(state.keyframe_index, result, missing) if followed else missing
-
-    def _follow_by_depth(self, frame: CurrentFrame) -> PoseCandidate | Reason:
-        """Follow a frame with frozen color by its depth alone, for a few frames: on walls it drifts soon."""
-        state, tracking = self.state, self.state.config.tracking
-        too_many = state.frames_without_color > tracking.failure.max_frames_without_color
-        if too_many or state.lost or not state.keyframes:
-            return Reason.FROZEN_COLOR
-        predicted = state.predict(frame.stamp_ns)
-        depth_only = tracking.registration.model_copy(update={"residuals": "depth"})
-        result = register(
-            state.keyframe.reference,
-            frame.pyramid,
-            predicted.T_keyframe_camera,
-            depth_only,
-            prior_information=predicted.information,
-        )
-        return (
-            PoseCandidate(state.keyframe_index, result, Reason.FROZEN_COLOR)
-            if result.ok
-            else Reason.FROZEN_COLOR
-        )
-
-    # --- predict, register, verify --------------------------------------------------------------------------------
-
-    def _register_nearby(self, frame: CurrentFrame) -> PoseCandidate | Reason:
-        """The first registration near the last pose that passes its checks, or why the first one failed."""
-        reason = Reason.NONE
-        for candidate, checks in self._attempts(frame):
-            found = verify(checks, self.state, frame, candidate)
-            if isinstance(found, PoseCandidate):
-                return found
-            reason = reason if reason is not Reason.NONE else found
-        return reason
-
-    def _attempts(self, frame: CurrentFrame) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
-        """Registrations near the last pose, each with its checks.
-
-        From the prediction, from the motion that features agree on, then with wider gates. Where the prediction is
-        weak, features come first and may outweigh what looks unlike, and color alone, which starts from it, is no
-        check. Where it is not, what looks unlike is another place.
-        """
-        state, tracking, index = self.state, self.state.config.tracking, self.state.keyframe_index
-        last, predicted = state.T_keyframe_camera, state.predict(frame.stamp_ns)
-        weak = predicted.sigma_px > tracking.prior.max_deviation_px and not state.lost
-        starts = [predicted.T_keyframe_camera]
-        if predicted.T_keyframe_camera is not last:
-            starts.append(last)
-        if weak:
-            yield from self._from_features(frame)
-        if not state.lost:
-            for start in starts:
-                information = predicted.information if start is predicted.T_keyframe_camera else None
-                result = register(
-                    state.keyframe.reference,
-                    frame.pyramid,
-                    start,
-                    tracking.registration,
-                    prior_information=information,
-                )
-                yield PoseCandidate(index, result), PLAUSIBLE if weak else FOLLOWED
-        if not weak:
-            for index, guess in initial_motions(state, frame):
-                result = register_until_stable(
-                    state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
-                )
-                yield PoseCandidate(index, result), FOUND_NEARBY
-        for start in starts:
-            result = register_until_stable(
-                state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
-            )
-            yield PoseCandidate(index, result), PLAUSIBLE if weak else FOUND_NEARBY
-
-    def _from_features(self, frame: CurrentFrame) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
-        """Registrations from the motion that features agree on, each with its checks."""
-        state, tracking = self.state, self.state.config.tracking.verified_by_features()
-        for index, guess in initial_motions(state, frame):
-            result = register_until_stable(
-                state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
-            )
-            yield PoseCandidate(index, result), FOUND_BY_FEATURES
-
-    # --- update ---------------------------------------------------------------------------------------------------
+            return register_nearby(self.state, frame)
+        return self._relocalizer.locate(self.state, frame)
 
     def _initialize(self, frame: CurrentFrame) -> TrackedFrame:
         """Make the first keyframe, unless the frame is held out or shows too little surface."""

@@ -1,0 +1,88 @@
+"""Registration of a frame near the last pose of the camera, from several starts, each with the checks to pass."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.feature_initialization import initial_motions
+from duagc.pipeline.frontend.pose_checks import (
+    FOLLOWED,
+    FOUND_BY_FEATURES,
+    FOUND_NEARBY,
+    PLAUSIBLE,
+    PoseCheck,
+    verify,
+)
+from duagc.pipeline.frontend.stable_registration import register_until_stable
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
+from duagc.pipeline.registration import register
+
+
+def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason:
+    """The first registration near the last pose that passes its checks, or why the first one failed.
+
+    Args:
+        state: what the tracker knows.
+        frame: the current frame.
+    """
+    reason = Reason.NONE
+    for candidate, checks in _attempts(state, frame):
+        found = verify(checks, state, frame, candidate)
+        if isinstance(found, PoseCandidate):
+            return found
+        reason = reason if reason is not Reason.NONE else found
+    return reason
+
+
+def _attempts(
+    state: TrackingState, frame: CurrentFrame
+) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
+    """Registrations near the last pose, each with its checks.
+
+    From the prediction, from the motion that features agree on, then with wider gates. Where the prediction is
+    weak, features come first and may outweigh what looks unlike, and color alone, which starts from it, is no
+    check. Where it is not, what looks unlike is another place.
+    """
+    tracking, index = state.config.tracking, state.keyframe_index
+    last, predicted = state.T_keyframe_camera, state.predict(frame.stamp_ns)
+    weak = predicted.sigma_px > tracking.prior.max_deviation_px and not state.lost
+    starts = [predicted.T_keyframe_camera]
+    if predicted.T_keyframe_camera is not last:
+        starts.append(last)
+    if weak:
+        yield from _from_features(state, frame)
+    if not state.lost:
+        for start in starts:
+            information = predicted.information if start is predicted.T_keyframe_camera else None
+            result = register(
+                state.keyframe.reference,
+                frame.pyramid,
+                start,
+                tracking.registration,
+                prior_information=information,
+            )
+            yield PoseCandidate(index, result), PLAUSIBLE if weak else FOLLOWED
+    if not weak:
+        for index, guess in initial_motions(state, frame):
+            result = register_until_stable(
+                state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
+            )
+            yield PoseCandidate(index, result), FOUND_NEARBY
+    for start in starts:
+        result = register_until_stable(
+            state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
+        )
+        yield PoseCandidate(index, result), PLAUSIBLE if weak else FOUND_NEARBY
+
+
+def _from_features(
+    state: TrackingState, frame: CurrentFrame
+) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
+    """Registrations from the motion that features agree on, each with its checks."""
+    tracking = state.config.tracking.verified_by_features()
+    for index, guess in initial_motions(state, frame):
+        result = register_until_stable(
+            state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
+        )
+        yield PoseCandidate(index, result), FOUND_BY_FEATURES
