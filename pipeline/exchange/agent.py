@@ -26,32 +26,30 @@ images and a map, the agents of `duagc posegraph` have a file (`team_posegraph`)
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
-from duagc.pipeline.exchange.link_starts import LinkStarts
+from duagc.pipeline.exchange.frame_flooding import FrameFlooding
+from duagc.pipeline.exchange.link_starts import LinkStarts, closures_selected
 from duagc.pipeline.exchange.loop_closing import LoopClosing
 from duagc.pipeline.exchange.map_alignment import MapAlignment
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.own_graph import OwnGraph
-from duagc.pipeline.exchange.radio import Radio
+from duagc.pipeline.exchange.radio import LOOP_CLOSING_KINDS, Radio
 from duagc.pipeline.exchange.shared_data import SharedData
 from duagc.pipeline.exchange.solvers import LinkStart, PoseSolver, SolverFactory, SolverStart, solver_of
 from duagc.pipeline.exchange.wire import state_wire
-from duagc.pipeline.exchange.wire.state_wire import RelativeFrames, State, pair_bit
+from duagc.pipeline.exchange.wire.state_wire import State, pair_bit
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.messages import Arrival, Message, Outgoing
 from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError
 
 WHOLE_COMPONENT = 255  # a hop count that has reached the whole component, for good
 MAX_EARLY_MESSAGES = 64
-LOOP_CLOSING_KINDS = frozenset(
-    {Kind.HELLO, Kind.DESCRIPTORS, Kind.SAMPLE, Kind.REQUEST, Kind.CLOSURES, Kind.KEYFRAMES}
-)
 
 
 class Agent:
@@ -113,6 +111,7 @@ class Agent:
         self.refused: Counter[str] = Counter()
         margin = config.consensus.closures.margin if loop_closing.revokes else np.inf
         self.alignment = MapAlignment(self.own, self.team, margin, short=not sharing.enabled)
+        self._frames = FrameFlooding(self.radio, self.alignment)
         self.alignment_hops = self.converged_hops = 0
         self.poses: PoseSolver | None = None
         self.links: dict[int, LinkStart] = {}
@@ -139,12 +138,7 @@ class Agent:
         for data in delivered:
             self._take(data)
         self._drop_silent_neighbors()
-        for neighbor in self.radio.in_contact:
-            heard = neighbor.transport.last_heard is not None
-            if heard and not neighbor.hello_sent:
-                neighbor.hello_sent = True
-                if self.loop_closing.greeting is not None:
-                    self.radio.send(neighbor, Kind.HELLO, self.loop_closing.greeting)
+        self.radio.greet()
         self._merge_revocations()
         self._update_alignment()
         self._update_poses()
@@ -202,42 +196,20 @@ class Agent:
         if arrival.kind is Kind.STATE:
             self._take_state(n, payload)
         elif arrival.kind in LOOP_CLOSING_KINDS:
-            self._take_loop_closing(n, arrival.kind, payload)
+            self.radio.take_loop_closing(n, arrival.kind, payload)
         elif arrival.kind is Kind.RELATIVE_FRAME:
             if self.poses is not None:
                 raise MalformedError("frame: all of them were known before the poses began")
-            n.passed.frames.setdefault(self.alignment.receive(payload, self._held_pairs()), 0)
+            self._frames.take(n, payload)
         elif arrival.kind is Kind.TREE:
             self._take_tree(n, payload)
         else:
             self.sharing.take(n, arrival, self.round, self.neighbors)
 
-    def _take_loop_closing(self, n: Neighbor, kind: Kind, payload: bytes) -> None:
-        """A message of the protocol with a neighbor, which begins when it is known which end has which role."""
-        if n.loop_closing is None or kind is Kind.HELLO:
-            protocol = self.loop_closing.protocol(n.name, kind, payload)
-            if n.loop_closing is None:
-                n.loop_closing = protocol
-                protocol.begin(self.radio.sender(n))
-        if kind is not Kind.HELLO:
-            n.loop_closing.take(kind, payload, self.radio.sender(n))
-
-    def _held_pairs(self) -> set[tuple[int, int]]:
-        """Pairs of this robot whose relative frame no other robot decides."""
-        return {
-            _pair(self.own, n.index)
-            for n in self.neighbors.values()
-            if n.loop_closing is None or n.loop_closing.decides
-        }
-
     def _take_state(self, n: Neighbor, payload: bytes) -> None:
         n.state, poses = state_wire.read_state(payload, len(self.team))
-        if (
-            poses
-            and n.state.revoked_links == self.alignment.revoked
-            and self.poses is not None
-            and n.index in self.links
-        ):
+        same = n.state.revoked_links == self.alignment.revoked
+        if poses and same and self.poses is not None and n.index in self.links:
             self.poses.take_state(self.links[n.index], poses)
 
     def _take_tree(self, n: Neighbor, payload: bytes) -> None:
@@ -324,13 +296,13 @@ class Agent:
         self.alignment_hops = self.converged_hops = 0
         self.poses, self.links = None, {}
 
-    def _same_links(self, n: Neighbor) -> bool:
-        """Whether a neighbor's last state is about the team with the same links."""
-        state = n.state
-        return state is not None and (state.links, state.revoked_links) == (
-            self.alignment.links,
-            self.alignment.revoked,
-        )
+    def _one_more_hop(self, joined: Sequence[Neighbor], count_of: Callable[[State], int]) -> int:
+        """One more than the least count of the joined neighbors; 0 of one that knows other links of the team."""
+        links, counts = (self.alignment.links, self.alignment.revoked), [WHOLE_COMPONENT - 1]
+        for n in joined:
+            same = n.state is not None and (n.state.links, n.state.revoked_links) == links
+            counts.append(count_of(n.state) if n.state is not None and same else 0)
+        return min(counts) + 1
 
     # --- alignment
 
@@ -339,28 +311,12 @@ class Agent:
 
         To have decided is also that the neighbors have what this robot knows: when all have, nothing new comes.
         """
-        joined = self.radio.joined
-        for n in joined:
-            pair = _pair(self.own, n.index)
-            assert n.loop_closing is not None
-            assert n.loop_closing.joined is not None
-            proposals = n.loop_closing.joined.proposals
-            if proposals and pair not in self.alignment.pairs:
-                if pair[0] != self.own:
-                    proposals = tuple(p.reversed() for p in proposals)
-                self.alignment.add(RelativeFrames(*pair, proposals))
-        for n in joined:
-            for pair in sorted(self.alignment.payloads):
-                if pair not in n.passed.frames:
-                    payload = self.alignment.payloads[pair]
-                    n.passed.frames[pair] = self.radio.send(n, Kind.RELATIVE_FRAME, payload)
+        joined, acknowledged = self.radio.joined, self._frames.advance()
         if self.alignment_hops == WHOLE_COMPONENT:
             return
         self.alignment_hops = 0
-        acknowledged = not any(n.transport.is_open(m) for n in joined for m in n.passed.frames.values())
         if acknowledged and all(n.decided for n in self.neighbors.values()):
-            hops = [n.state.alignment_hops if n.state and self._same_links(n) else 0 for n in joined]
-            self.alignment_hops = min([WHOLE_COMPONENT - 1, *hops]) + 1
+            self.alignment_hops = self._one_more_hop(joined, lambda state: state.alignment_hops)
         if self.alignment_hops >= len(self.team):
             self.alignment_hops = WHOLE_COMPONENT
 
@@ -372,12 +328,12 @@ class Agent:
         if self.alignment_hops < WHOLE_COMPONENT or not joined:
             return
         if self.poses is None:
-            if any(_pair(self.own, n.index) not in self.alignment.pairs for n in joined):
+            if any(self._frames.pair_with(n) not in self.alignment.pairs for n in joined):
                 return  # a forged state counted hops that are not there
             if self.loop_closing.revokes and (undecided := self.alignment.undecided):
                 self._revoke_links(self.alignment.revoked | undecided)
                 return
-            if not self._closures_selected(joined):
+            if not closures_selected(self.radio, self.alignment):
                 return
             self._start_poses()
         assert self.poses is not None
@@ -398,22 +354,11 @@ class Agent:
             return
         self.converged_hops = 0
         if self.poses.converged:
-            hops = [n.state.converged_hops if n.state and self._same_links(n) else 0 for n in joined]
-            self.converged_hops = min([WHOLE_COMPONENT - 1, *hops]) + 1
+            self.converged_hops = self._one_more_hop(joined, lambda state: state.converged_hops)
         if self.converged_hops > len(self.team):
             self.agreed, self.converged_hops = True, WHOLE_COMPONENT
             self.rounds_to_agreement = self.round
             self.sharing.add_poses(self.poses.T_world_keyframe, self.graph.T_map_keyframe[0])
-
-    def _closures_selected(self, joined: Sequence[Neighbor]) -> bool:
-        """Whether both ends of all links know which loop closures the solver gets."""
-        waiting = [n.loop_closing for n in joined if n.loop_closing and not n.loop_closing.selected]
-        if waiting:
-            own = self.alignment.T_world_first(self.own)
-            for n in joined:
-                if n.loop_closing in waiting:
-                    n.loop_closing.select(own, self.alignment.T_world_first(n.index), self.radio.sender(n))
-        return all(protocol.selected for protocol in waiting)
 
     def _start_poses(self) -> None:
         """Give the solver the own graph where it was placed, and the joined neighbors."""
@@ -450,7 +395,3 @@ class Agent:
                 for n in self.radio.joined
             )
             self.converged = self.done
-
-
-def _pair(a: int, b: int) -> tuple[int, int]:
-    return min(a, b), max(a, b)

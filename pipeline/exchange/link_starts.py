@@ -1,4 +1,4 @@
-"""Where the links of a robot start when the poses begin."""
+"""What the links of a robot start from when the poses begin: selected loop closures, weights and copies."""
 
 from __future__ import annotations
 
@@ -10,8 +10,26 @@ from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.exchange.map_alignment import MapAlignment
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.own_graph import OwnGraph
+from duagc.pipeline.exchange.radio import Radio
 from duagc.pipeline.exchange.solvers import LinkStart
 from duagc.pipeline.posegraph.loop_closures import plausible
+
+
+def closures_selected(radio: Radio, alignment: MapAlignment) -> bool:
+    """Whether both ends of all links know which loop closures the solver gets; they are selected where they do not.
+
+    Args:
+        radio: own end of all radio links.
+        alignment: where the maps of the team lie.
+    """
+    joined = radio.joined
+    waiting = [n.loop_closing for n in joined if n.loop_closing and not n.loop_closing.selected]
+    if waiting:
+        own = alignment.T_world_first(alignment.own)
+        for n in joined:
+            if n.loop_closing in waiting:
+                n.loop_closing.select(own, alignment.T_world_first(n.index), radio.sender(n))
+    return all(protocol.selected for protocol in waiting)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,13 @@ from duagc.pipeline.network.packets import Kind, MalformedError, Packet, parse
 from duagc.pipeline.network.signatures import Identity
 from duagc.pipeline.network.transport import Transport
 
+LOOP_CLOSING_KINDS = frozenset(
+    {Kind.HELLO, Kind.DESCRIPTORS, Kind.SAMPLE, Kind.REQUEST, Kind.CLOSURES, Kind.KEYFRAMES}
+)
+
 
 class Radio:
-    """Numbers the messages of a robot, and opens the packets that are for it.
+    """Numbers the messages of a robot, opens the packets that are for it, and begins the loop-closing protocols.
 
     Attributes:
         team: names of all robots that may exist, sorted.
@@ -48,15 +52,16 @@ class Radio:
         self._identity = None
         if config.signatures == "ed25519":
             self._identity = Identity.simulated(seed, self.team, robot)
+        self._loop_closing = loop_closing
         self._messages = 0
-        self.neighbors = {self.team.index(name): self._met(name, loop_closing) for name in sorted(neighbors)}
+        self.neighbors = {self.team.index(name): self._met(name) for name in sorted(neighbors)}
 
-    def _met(self, name: str, loop_closing: LoopClosing) -> Neighbor:
+    def _met(self, name: str) -> Neighbor:
         index = self.team.index(name)
         transport = Transport(
             self.own, index, name, self._config, new_id=self.new_id, identity=self._identity
         )
-        neighbor = Neighbor(index, name, transport, loop_closing.initial(name))
+        neighbor = Neighbor(index, name, transport, self._loop_closing.initial(name))
         if neighbor.loop_closing is not None:
             neighbor.loop_closing.begin(self.sender(neighbor))
         return neighbor
@@ -97,7 +102,33 @@ class Radio:
             raise MalformedError("from a neighbor that was given up")
         return self.neighbors[packet.sender]
 
+    def take_loop_closing(self, n: Neighbor, kind: Kind, payload: bytes) -> None:
+        """A message of the protocol with a neighbor, which begins when it is known which end has which role.
+
+        Args:
+            n: the neighbor.
+            kind: one of LOOP_CLOSING_KINDS.
+            payload: of the message.
+        Raises:
+            ValueError: it cannot be used; the message says why.
+        """
+        if n.loop_closing is None or kind is Kind.HELLO:
+            protocol = self._loop_closing.protocol(n.name, kind, payload)
+            if n.loop_closing is None:
+                n.loop_closing = protocol
+                protocol.begin(self.sender(n))
+        if kind is not Kind.HELLO:
+            n.loop_closing.take(kind, payload, self.sender(n))
+
     # --- outgoing
+
+    def greet(self) -> None:
+        """Greet every neighbor that was heard for the first time."""
+        for neighbor in self.in_contact:
+            if neighbor.transport.last_heard is not None and not neighbor.hello_sent:
+                neighbor.hello_sent = True
+                if self._loop_closing.greeting is not None:
+                    self.send(neighbor, Kind.HELLO, self._loop_closing.greeting)
 
     def new_id(self) -> int:
         """The next number of a message."""
