@@ -69,28 +69,41 @@ def found_afterwards(
         return list(frames)
     posed = [k for k, frame in enumerate(frames) if frame.status is not Status.LOST]
     done, out = checkpoints.resume(part) or (0, list(frames))
-    for k, frame in enumerate(frames[done:], done):
-        checkpoints.at(part, k, len(frames), lambda: out)
-        after = int(np.searchsorted(posed, k))
-        if frame.status is not Status.LOST or frame.reason not in LOOKED_FOR or after in (0, len(posed)):
-            continue
-        around = frames[posed[after - 1]], frames[posed[after]]
-        near = _anchors(frames, posed, after, config.tracking.relocalization.look_again_keyframes)
-        pyramid = images(frame.frame_index, len(config.tracking.strides))
-        for keyframe, result in _registrations(frame, pyramid, [keyframes[n] for n in near], config):
-            T_map_camera = T_map_keyframes[keyframe.keyframe_index] @ result.T_reference_target
-            if all(
-                _within_reach(frame, T_map_camera, other, T_map_keyframes, config=config) for other in around
-            ):
-                out[k] = TrackedFrame.by(
-                    frame.frame_index,
-                    frame.stamp_ns,
-                    keyframe_index=keyframe.keyframe_index,
-                    result=result,
-                    status=Status.RELOCALIZED,
-                )
-                break
+    for k in range(done, len(frames)):
+        found = _found(k, frames, keyframes, T_map_keyframes, posed=posed, images=images, config=config)
+        out[k] = found or out[k]
+        checkpoints.at(part, k + 1, len(frames), lambda: out)
     return out
+
+
+def _found(
+    k: int,
+    frames: Sequence[TrackedFrame],
+    keyframes: Sequence[TrackedKeyframe],
+    T_map_keyframes: Array,
+    *,
+    posed: Sequence[int],
+    images: Images,
+    config: FrontendConfig,
+) -> TrackedFrame | None:
+    """Frame k with a pose, if it is a lost one that is found between its neighbors; posed: frames that have one."""
+    frame, after = frames[k], int(np.searchsorted(posed, k))
+    if frame.status is not Status.LOST or frame.reason not in LOOKED_FOR or after in (0, len(posed)):
+        return None
+    around = frames[posed[after - 1]], frames[posed[after]]
+    near = _anchors(frames, posed, after, config.tracking.relocalization.look_again_keyframes)
+    pyramid = images(frame.frame_index, len(config.tracking.strides))
+    for keyframe, result in _registrations(frame, pyramid, [keyframes[n] for n in near], config):
+        T_map_camera = T_map_keyframes[keyframe.keyframe_index] @ result.T_reference_target
+        if all(_within_reach(frame, T_map_camera, other, T_map_keyframes, config=config) for other in around):
+            return TrackedFrame.by(
+                frame.frame_index,
+                frame.stamp_ns,
+                keyframe_index=keyframe.keyframe_index,
+                result=result,
+                status=Status.RELOCALIZED,
+            )
+    return None
 
 
 def _anchors(frames: Sequence[TrackedFrame], posed: Sequence[int], after: int, count: int) -> list[int]:
