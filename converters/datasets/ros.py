@@ -54,6 +54,8 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         out: folder of the recording.
         robots: how many there must be; 0: as many as are found.
         force: replace a recording that is there.
+        options: of `Options`, by name.
+
     Raises:
         DuagError: names log and topic, what was found and what was expected.
     """
@@ -117,8 +119,6 @@ def write_robot(
         name: of the robot.
         source: its log.
         label: which part of the source it was.
-        max_ratio: see `ReprojectionCheck`.
-        gap: see `ReprojectionCheck`.
         max_ratio: largest residual of the self-check, as a share of the depth.
         gap: frames between those that the self-check compares.
     """

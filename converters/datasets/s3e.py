@@ -81,6 +81,8 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         out: folder of the recording.
         robots: how many there must be; 0: as many as are found.
         force: replace a recording that is there.
+        options: of `Options`, by name.
+
     Raises:
         DuagError: names file and topic, what was found and what was expected.
     """

@@ -57,11 +57,24 @@ class CameraWatch:
     """Watches that what a CameraInfo says does not change: a camera of the recording is one camera."""
 
     def __init__(self, first: Mapping[str, tuple[RosCamera, bool]], name: str) -> None:
+        """Begin with the first message of every topic.
+
+        Args:
+            first: by topic, the camera that it says, and whether its images are rectified.
+            name: of the log.
+        """
         self._first, self._name = first, name
         self._seen: dict[str, bytes] = {}
 
     def see(self, entry: Entry) -> None:
-        """Compare a message with the first one. Raises DuagError where the difference can be seen in images."""
+        """Compare a message with the first one of its topic.
+
+        Args:
+            entry: the message.
+
+        Raises:
+            DuagError: the difference can be seen in images.
+        """
         rest = entry.data[16:]  # in ROS what follows the times of the header, most often the same bytes
         if self._seen.get(entry.topic) == rest:
             return

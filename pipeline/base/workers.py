@@ -29,7 +29,8 @@ def worker_pool(
     Args:
         workers: how many.
         start: called once in each of them before its first task.
-        arguments: called once in each of them before its first task.
+        arguments: of `start`.
+
     Raises:
         DuagError: a process ended before its task did, for example for want of memory.
     """

@@ -32,8 +32,10 @@ def run(src: Path, options: Sequence[str], folder: Path) -> dict[str, Any]:
     """Copy a log and convert it.
 
     Args:
-        src: a log of one robot. options: `name=value` of the conversion. folder: must not exist; results are written
-            there and removed.
+        src: a log of one robot.
+        options: `name=value` of the conversion.
+        folder: must not exist; results are written there and removed.
+
     Returns:
         The size of the log in bytes; for "copy" and "convert" the processor time and the wall time in seconds, the
         largest memory and what was written in bytes.

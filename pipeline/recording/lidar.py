@@ -34,8 +34,11 @@ def lidar_depth(
     """Depth of a sweep as the camera would see it, and its standard deviation.
 
     Args:
-        points_lidar: [n, 3], meters, of one sweep, all as of one time. T_camera_lidar: [4, 4].
+        points_lidar: [n, 3], meters, of one sweep, all as of one time.
+        T_camera_lidar: [4, 4], pose of the LiDAR in the camera.
+        camera: that sees them.
         range_sigma_m: standard deviation of a range.
+
     Returns:
         Depth along z and sigma, float32 [camera.height, camera.width], meters; both 0 where nothing is known.
     """

@@ -36,7 +36,10 @@ def register_depth(
 
     Args:
         depth_m: [h, w], meters along z of the depth camera, 0 = unknown.
-        T_camera_depth: [4, 4].
+        depth_camera: that measured it.
+        T_camera_depth: [4, 4], pose of the depth camera in the other one.
+        camera: the other one.
+
     Returns:
         float32 [camera.height, camera.width], meters along z of `camera`, 0 = unknown.
     """

@@ -131,7 +131,10 @@ def lines(
     """Curves over a common axis.
 
     Args:
-        series: name -> (x, y). log: logarithmic y axis; values that are not positive are left out.
+        series: name -> (x, y).
+        x_label: of the common axis.
+        y_label: of the other axis.
+        log: logarithmic y axis; values that are not positive are left out.
         level: a horizontal line to compare with, for example a tolerance.
     """
     from matplotlib.ticker import MaxNLocator

@@ -38,7 +38,9 @@ def view(path: Path, save: Path | None = None, screenshot: Path | None = None) -
 
     Args:
         path: folder of a run or of a recording, or an .mcap or .rrd file.
-        save: write this .rrd file instead of opening a window. screenshot: write this PNG instead.
+        save: write this .rrd file instead of opening a window.
+        screenshot: write this PNG instead.
+
     Raises:
         DuagError: the path is none of these, or no picture can be drawn on this machine.
     """

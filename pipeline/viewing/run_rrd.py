@@ -37,8 +37,11 @@ def write_rrd(run_dir: Path, recording: Path, out: Path, max_gaussians: int = 30
     """Write a run as one .rrd file with its own layout.
 
     Args:
-        run_dir: folder of the run. recording: folder of its recording. out: the file; appears when it is complete.
+        run_dir: folder of the run.
+        recording: folder of its recording.
+        out: the file; appears when it is complete.
         max_gaussians: of each map; a larger map is thinned to those that cover most of the image.
+
     Returns:
         `out`.
     """
