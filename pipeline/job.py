@@ -83,7 +83,8 @@ class Job:
         self._calibration: dict[str, Any] = {}
         self._before: list[Carried] = []
         self._place = place
-        self._watch, self._where = Watch(self._hear), None  # type: Watch, Any
+        self._watch = Watch(self._hear)
+        self._where: Any = None  # of the server that shows the run
         self._time_left: TimeLeft | None = None
 
     def run(self) -> None:

@@ -18,15 +18,6 @@ from duagc.pipeline.comparison.summary import ORDER, RunSummary, TopicSummary, m
 RELATIVE_TOLERANCE = 1e-9  # of metrics: evaluation sums in one order, but its libraries may round otherwise
 
 
-def is_golden(path: Path) -> bool:
-    """Whether a path is that of a golden run.
-
-    Args:
-        path: any path.
-    """
-    return path.suffix == ".json" and path.with_suffix(".npz").is_file()
-
-
 def store(golden: Path, run: Path) -> None:
     """Write a golden run: the file, for people, and its .npz, 16 bits a message.
 

@@ -12,7 +12,6 @@ APART = 0.1
 """Relative step below the greatest depth from which no surface leads to it."""
 STEPS_APART = 10
 """Times the usual step between depths of a sensor that counts in coarse ones, likewise."""
-
 LEAST_SHARE = 0.005
 """Of the known depth of each image that this distance has."""
 
@@ -41,7 +40,6 @@ def greatest_apart(depth: NDArray[Any]) -> float:
     if len(values) < 3 or counts[-1] < 2:
         return 0.0
     steps = np.diff(np.log(values.astype(np.float64)))
-    usual = (
-        float(np.median(steps[:-1][values[:-2] >= values[-2] / 2])) if values[-3] >= values[-2] / 2 else APART
-    )
+    upper = values[:-2] >= values[-2] / 2
+    usual = float(np.median(steps[:-1][upper])) if upper.any() else APART
     return float(values[-1]) if steps[-1] > max(APART, STEPS_APART * usual) else 0.0
