@@ -46,7 +46,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def finished(recording: Path) -> Path:
     out = recording.with_name("run")
-    run(recording, out, load_config(RunConfig, overrides=SETTINGS), workers=1, log=lambda line: None)
+    config = load_config(RunConfig, overrides=SETTINGS)
+    run(recording, out, config, workers=1, until="report", log=lambda line: None)
     return out
 
 

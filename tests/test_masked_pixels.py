@@ -16,16 +16,9 @@ from duagc.pipeline.runner import run
 from duagc.pipeline.runs.digest import digest_file, result_files
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.schemas import topics
+from tests.fixtures.small_run import SMALL
 
 SIZE = (160, 120)
-SMALL = (
-    "frontend.mapping.max_gaussians=3000",
-    "frontend.mapping.iterations=8",
-    "frontend.mapping.final_iterations=8",
-    "frontend.mapping.final_iterations_view=0",
-    "exchange.max_rounds=400",
-    "fusion.finetune.steps_per_view=2",
-)
 
 
 def body() -> np.ndarray:
@@ -81,8 +74,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Path]]:
     for seed in (None, 7):
         recording = masked(plain, folder / f"recording-{seed}", seed)
         config = load_config(RunConfig, overrides=SMALL)
-        run(recording, folder / f"run-{seed}", config, workers=1, log=lambda line: None)
-        out.append((recording, folder / f"run-{seed}"))
+        out_folder = folder / f"run-{seed}"
+        run(recording, out_folder, config, workers=1, until="evaluation", log=lambda line: None)
+        out.append((recording, out_folder))
     return out
 
 

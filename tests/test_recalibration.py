@@ -30,16 +30,9 @@ from duagc.pipeline.replay import replay
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.runs.stages import CALIBRATED
+from tests.fixtures.small_run import SMALL
 
 CAMERAS = [PinholeCamera(64, 48, f, f, 31.5, 23.5) for f in (60.0, 70.0)]
-SMALL = (
-    "frontend.mapping.max_gaussians=3000",
-    "frontend.mapping.iterations=8",
-    "frontend.mapping.final_iterations=8",
-    "frontend.mapping.final_iterations_view=0",
-    "exchange.max_rounds=400",
-    "fusion.finetune.steps_per_view=2",
-)
 BETTER, SAME = Quality(0.6, 0.7, 1.1), Quality(0.8, 0.9, 1.2)
 
 
