@@ -64,11 +64,11 @@ def _attempts(
             )
             yield PoseCandidate(index, result), PLAUSIBLE if weak else FOLLOWED
     if not weak:
-        for index, guess in initial_motions(state, frame):
+        for other, guess in initial_motions(state, frame):
             result = register_until_stable(
-                state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
+                state.keyframes[other], frame.pyramid, guess, tracking, first=tracking.registration
             )
-            yield PoseCandidate(index, result), FOUND_NEARBY
+            yield PoseCandidate(other, result), FOUND_NEARBY
     for start in starts:
         result = register_until_stable(
             state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
