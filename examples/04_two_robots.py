@@ -24,7 +24,7 @@ def main() -> None:
             "fusion.finetune.steps_per_view=4",
         ]  # quicker, less detail
         config = duagc.load_config(duagc.RunConfig, overrides=["exchange.link.loss_probability=0.2", *small])
-        duagc.run(folder / "recording", folder / "run", config)
+        duagc.run(folder / "recording", folder / "run", config, until="evaluation")  # without report and view
         metrics = json.loads((folder / "run" / "metrics.json").read_text())
         for name, robot in duagc.RunFolder(folder / "run").robots.items():
             team = ", ".join(robot.component)
