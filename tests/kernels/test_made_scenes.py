@@ -110,8 +110,16 @@ def test_every_kind_alone(shape, place, opacity, depth):
     assert_agreement(made_scene(seed, [(shape, place, opacity)], camera), depth)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("depth", DEPTH_KINDS)
+def fixed() -> list:
+    """All fixed scenes with both depths; `make test` takes each scene with one of them, in turn."""
+    return [
+        pytest.param(kind, depth, marks=() if (k + m) % len(DEPTH_KINDS) == 0 else pytest.mark.slow)
+        for k, kind in enumerate(KINDS)
+        for m, depth in enumerate(DEPTH_KINDS)
+    ]
+
+
+@pytest.mark.parametrize(("kind", "depth"), fixed())
 def test_fixed_scenes(kind, depth):
     assert_agreement(make_scene(kind), depth)
 
