@@ -73,7 +73,7 @@ RUNS = {
 
 
 def make_run(name: str, folder: Path) -> Path:
-    """Make the recording of a golden run and run all stages on it.
+    """Make the recording of a golden run and run the stages on it of which something is stored.
 
     Args:
         name: a key of `RUNS`.
@@ -84,5 +84,6 @@ def make_run(name: str, folder: Path) -> Path:
     golden = RUNS[name]
     golden.make(folder / "recording")
     config = load_config(RunConfig, overrides=golden.overrides)
-    run(folder / "recording", folder / "run", config, workers=SCRIPT_WORKERS, log=lambda line: None)
-    return folder / "run"
+    out = folder / "run"
+    run(folder / "recording", out, config, workers=SCRIPT_WORKERS, until="evaluation", log=lambda line: None)
+    return out
