@@ -31,6 +31,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import PosePacket, rounded
 from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.exchange.matched_pairs import MatchedPairs, moved
 from duagc.pipeline.exchange.solvers import LinkStart, Matcher, SolverStart
 from duagc.pipeline.exchange.wire.algorithm_1_wire import (
     Setup,
@@ -43,7 +44,6 @@ from duagc.pipeline.exchange.wire.algorithm_1_wire import (
 )
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.least_squares import retract
@@ -54,39 +54,12 @@ ARMIJO, HALVINGS = 0.75, 40
 nearly twice the way to the minimum, each overshoots where the other was, and both fly apart."""
 PRIMAL = 1e-4  # m, rad: the paper's stopping test
 DAMPING = 0.7  # both ends of a link step at once
-SCATTER_M = 0.01
-"""Standard deviation by which the means of two matched Gaussians differ where both maps are right."""
-SPLATS_PER_SAMPLE = 30.0
-"""Gaussians that share a pixel: their information is of the same measurements and counts once."""
 ROUNDS_BEFORE_MATCHING = 10
 """Until poses are near enough to their final ones to match at."""
 STILL_ROUNDS = 8
 """Rounds without a step above the tolerance after which a robot has converged."""
 POSES, MEANS = b"\0", b"\1"
 _HEAD = struct.Struct("<I")  # round of the sender
-
-
-@dataclass
-class _Pairs:
-    """Matched Gaussians with one neighbor.
-
-    Attributes:
-        anchor: [p] own keyframes.
-        mean: [p, 3], own means in these keyframes.
-        peer_anchor: [p] keyframes of the neighbor.
-        peer_mean: [p, 3], its means there, as it sent its evidence.
-        weight: [p, 3, 3], of the distance, in the common frame.
-        own_share: [p, 3], of the own value in an average.
-        peer_common: [p, 3], the neighbor's means in the common frame, as they last came; as printed only.
-    """
-
-    anchor: NDArray[np.int64]
-    mean: Array
-    peer_anchor: NDArray[np.int64]
-    peer_mean: Array
-    weight: Array
-    own_share: Array
-    peer_common: Array
 
 
 @dataclass
@@ -106,7 +79,7 @@ class _Peer:
     poses: Array | None = None
     between: RelativePoses = field(default_factory=RelativePoses.empty)
     multipliers: Array = field(default_factory=lambda: np.zeros((0, 6)))
-    pairs: _Pairs | None = None
+    pairs: MatchedPairs | None = None
     newest: int = -1
 
 
@@ -160,7 +133,8 @@ class Algorithm1Solver:
         self._still = self._still + 1 if self._step < self.config.tolerance else 0
         if self.printed:
             for peer in self._peers.values():
-                self._average(peer.pairs)
+                if peer.pairs is not None:
+                    peer.pairs.average(self._x)
                 peer.multipliers = peer.multipliers + self._penalty * self._residuals(peer)
 
     def _residuals(self, peer: _Peer) -> Array:
@@ -184,8 +158,8 @@ class Algorithm1Solver:
         pairs = peer.pairs
         assert pairs is not None
         assert peer.poses is not None
-        there = pairs.peer_common if self.printed else _moved(peer.poses[pairs.peer_anchor], pairs.peer_mean)
-        return _moved(x[pairs.anchor], pairs.mean) - there
+        there = pairs.peer_common if self.printed else moved(peer.poses[pairs.peer_anchor], pairs.peer_mean)
+        return pairs.common(x) - there
 
     def _gradient(self, curvature: Array | None = None) -> Array:
         """By own keyframes [n, 6]; adds what neighbors contribute to the curvature [n, 6, 6] to it, if it is given."""
@@ -238,14 +212,6 @@ class Algorithm1Solver:
         turn_rad = float(np.linalg.norm(delta[:, 3:], axis=1).max())
         return retract(self._x, delta * min(1.0, self.config.step_limit_rad / max(turn_rad, 1e-12)))
 
-    def _average(self, pairs: _Pairs | None) -> None:
-        """(12): own means become the average with the neighbor's, per dimension of the common frame."""
-        if pairs is not None:
-            T = self._x[pairs.anchor]
-            common = _moved(T, pairs.mean)
-            common = pairs.own_share * common + (1 - pairs.own_share) * pairs.peer_common
-            pairs.mean = _moved(se3.inverse(T), common)
-
     # --- matching
 
     def _match(self) -> None:
@@ -261,24 +227,9 @@ class Algorithm1Solver:
     def _take_pairs(self, peer: _Peer, ids: NDArray[np.int64]) -> None:
         """Lay out the pair terms of ids [p, 2], the own one first."""
         assert peer.poses is not None
-        anchor, mean, own = self._matcher.positions(self.own, ids[:, 0])
-        peer_anchor, peer_mean, other = self._matcher.positions(peer.link.index, ids[:, 1])
-        if len(ids) and (anchor.max() >= len(self._x) or peer_anchor.max() >= len(peer.poses)):
-            raise MalformedError("pairs: of a keyframe that does not exist")
-        R, Q = self._x[anchor, :3, :3], peer.poses[peer_anchor, :3, :3]
-        own, other = R @ own @ np.swapaxes(R, -1, -2), Q @ other @ np.swapaxes(Q, -1, -2)
-        a, b = (np.maximum(np.diagonal(w, axis1=1, axis2=2), 1e-9) for w in (own, other))
-        if self.printed:
-            weight = (a + b)[..., None] * np.eye(3)
-        else:
-            spread = 0.5 * SCATTER_M**2 * np.eye(3)
-            inverse = np.linalg.inv(add_covariance(own, spread) + 1e-9 * np.eye(3))
-            inverse = inverse + np.linalg.inv(add_covariance(other, spread) + 1e-9 * np.eye(3))
-            weight = np.linalg.inv(inverse) / SPLATS_PER_SAMPLE
-        common = _moved(peer.poses[peer_anchor], peer_mean)
-        peer.pairs = _Pairs(
-            anchor, mean, peer_anchor, peer_mean, weight=weight, own_share=a / (a + b), peer_common=common
-        )
+        own = self._matcher.positions(self.own, ids[:, 0])
+        other = self._matcher.positions(peer.link.index, ids[:, 1])
+        peer.pairs = MatchedPairs.of(own, other, self._x, peer.poses, printed=self.printed)
 
     # --- packets
 
@@ -300,7 +251,7 @@ class Algorithm1Solver:
         parts = [POSES + head + part for part in write_poses_in_parts(packet, room_bytes, decides=False)]
         pairs = self._peers[neighbor.index].pairs
         if self.printed and pairs is not None:
-            common = _moved(self._x[pairs.anchor], pairs.mean)
+            common = pairs.common(self._x)
             parts += [MEANS + head + part for part in write_means(common, room_bytes)]
         return parts
 
@@ -417,8 +368,3 @@ class Algorithm1Solver:
             },
             "factorizations": 0,
         }
-
-
-def _moved(T: Array, points: Array) -> Array:
-    """Points [p, 3] by one motion [p, 4, 4] each."""
-    return (T[:, :3, :3] @ points[..., None])[..., 0] + T[:, :3, 3]
