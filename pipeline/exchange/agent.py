@@ -2,7 +2,7 @@
 
     loop closing    protocols with every neighbor                             loop_closing.py
     alignment       relative frames of all pairs, flooded; agents that know the same pairs place the team alike
-                                                                              map_alignment.py
+                                                                              map_alignment.py, frame_flooding.py
     poses           rounds of a solver until all robots have converged        solvers.py
     sharing         evidence of every robot to every robot, agreed poses; the lower-named robot of a pair matches
                     Gaussians and floods the matches                          sharing.py, knowledge.py
