@@ -72,12 +72,13 @@ RUNS = {
 }
 
 
-def make_run(name: str, folder: Path) -> Path:
+def make_run(name: str, folder: Path, workers: int = SCRIPT_WORKERS) -> Path:
     """Make the recording of a golden run and run the stages on it of which something is stored.
 
     Args:
         name: a key of `RUNS`.
         folder: an empty folder; gets `recording/` and `run/`.
+        workers: of the run; changes no bit.
     Returns:
         The folder of the run.
     """
@@ -85,5 +86,5 @@ def make_run(name: str, folder: Path) -> Path:
     golden.make(folder / "recording")
     config = load_config(RunConfig, overrides=golden.overrides)
     out = folder / "run"
-    run(folder / "recording", out, config, workers=SCRIPT_WORKERS, until="evaluation", log=lambda line: None)
+    run(folder / "recording", out, config, workers=workers, until="evaluation", log=lambda line: None)
     return out

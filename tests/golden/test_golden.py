@@ -18,7 +18,7 @@ QUICK = "tiny3"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The golden run that is small enough for `make test`."""
-    return make_run(QUICK, tmp_path_factory.mktemp(QUICK))
+    return make_run(QUICK, tmp_path_factory.mktemp(QUICK), workers=1)
 
 
 def test_the_small_run_is_as_stored(run: Path) -> None:
