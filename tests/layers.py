@@ -205,7 +205,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             _MATHEMATICS,
             _LOGS,
             "posegraph network consensus exchange frontend fusion runs evaluation bench team_posegraph converters",
-            "batch report",
+            "batch cache report",
         ),
     ),
     (_part("replay", "computes a robot again", "base config runs recording exchange steps"),),

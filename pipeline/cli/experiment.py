@@ -1,12 +1,18 @@
 """The commands that decide claims by rules that were written before."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli.common import EXIT_DIFFERENT, StoreFolder, app, say
+
+if TYPE_CHECKING:
+    from duagc.pipeline.experiments.rule import Experiment
 
 experiment_app = typer.Typer(
     no_args_is_help=True, help="Claims, decided by rules that are written before the run."
@@ -16,16 +22,18 @@ app.add_typer(experiment_app, name="experiment")
 
 @experiment_app.command("list")
 def list_experiments() -> None:
-    """List the experiments with their titles.
+    """List the experiments with their titles, and what all of them take.
 
     Example: `duagc experiment list`
     """
     from duagc.pipeline.experiments.rule import experiment_names, read_experiment
 
-    names = experiment_names()
-    width = max(map(len, names), default=0)
-    for name in names:
-        print(f"{name:<{width}}  {read_experiment(name).file.title}")
+    found = [read_experiment(name) for name in experiment_names()]
+    width = max((len(one.name) for one in found), default=0)
+    for one in found:
+        print(f"{one.name:<{width}}  {one.file.title}")
+    for profile in ("small", "full"):
+        say(f"all, {profile}: {_predicted(found, profile)}")
 
 
 @experiment_app.command()
@@ -41,8 +49,7 @@ def show(
     found = read_experiment(name)
     print(f"# {found.name}, sha256 {found.sha256}")
     for profile, of in found.file.profiles.items():
-        cells = len(of.seeds) * len(found.file.configurations)
-        print(f"# {profile}: {len(of.seeds)} recordings, {cells} runs")
+        print(f"# {profile}: {len(of.seeds)} seeds, {_predicted([found], profile)}")
     print(found.path.read_text(encoding="utf-8"), end="")
 
 
@@ -132,6 +139,14 @@ def report(
             kind = "control" if verdict.rule.control else "rule"
             print(f"{one.experiment.name}  {kind} {verdict.rule.name}: {verdict.word} ({verdict.why})")
     print(f"page       {out / PAGE}")
+
+
+def _predicted(experiments: Sequence[Experiment], profile: str) -> str:
+    """What experiments take, as text for people."""
+    from duagc.pipeline.experiments.predicted import predicted_time
+
+    took = predicted_time(experiments, profile)
+    return f"{took.runs} runs, {took.different} different, about {took.cpu_s / 3600:.1f} h of processor time"
 
 
 def _named_folder(text: str) -> tuple[str, Path]:

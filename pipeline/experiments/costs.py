@@ -17,8 +17,13 @@ from duagc.pipeline.batch.results import TABLE
 from duagc.pipeline.experiments.statistics import mean
 
 COSTS = "costs.md"
-HEAD = """# Costs
+HEAD = """---
+kind: results
+generated: true
+---
+# Costs
 
+Made by `duagc experiment report DIR` of the [experiments](experiments.md).
 Means over the runs of each configuration; robots share a machine.
 Times are those of the stages when they were computed, memory is that of the largest process.
 

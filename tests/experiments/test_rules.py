@@ -10,6 +10,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.batch.suite import SuiteFile
 from duagc.pipeline.experiments.carry_out import prepare
 from duagc.pipeline.experiments.metric_names import KNOWN, names_in, needs_truth
+from duagc.pipeline.experiments.predicted import predicted_time
 from duagc.pipeline.experiments.rule import RULES, data_of, experiment_names, read_experiment
 from tests.fixtures import fake_run
 from tests.fixtures.commands import assert_one_line, duagc_here
@@ -145,6 +146,25 @@ def test_the_commands_name_what_there_is(tmp_path: Path) -> None:
         duagc_here("experiment", "run", "h1_team", "--profile", "medium", "--out", tmp_path), "small"
     )
     assert_one_line(duagc_here("experiment", "report", tmp_path), "found no result.json")
+
+
+def test_what_experiments_take_counts_equal_runs_once(folder: Path) -> None:
+    mine = read_experiment("mine", folder)
+    (folder / "twin.toml").write_text(FILE.replace('"a"', '"twin"'))
+    (folder / "larger.toml").write_text(FILE.replace("width = 32", "width = 320"))
+    alone = predicted_time([mine], "small")
+    assert (alone.runs, alone.different) == (10, 10)
+    both = predicted_time([mine, read_experiment("twin", folder)], "small")
+    assert (both.runs, both.different, both.cpu_s) == (20, 10, alone.cpu_s)
+    assert predicted_time([read_experiment("larger", folder)], "small").cpu_s > alone.cpu_s
+
+
+def test_a_front_end_counts_once_for_all_that_comes_after_it(folder: Path) -> None:
+    alone = predicted_time([read_experiment("mine", folder)], "small").cpu_s
+    (folder / "own.toml").write_text(
+        FILE.replace("exchange.link.loss_probability=0.3", "frontend.mapping.iterations=9")
+    )
+    assert predicted_time([read_experiment("own", folder)], "small").cpu_s > 1.1 * alone
 
 
 def test_a_recording_without_truth_is_refused_before_anything_runs(tmp_path: Path) -> None:

@@ -1,0 +1,63 @@
+"""How long experiments take, before they run: every different run once, and every different front end once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from duagc.pipeline.cache import durations
+from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.experiments.rule import Experiment, SimulatedData, config_of, data_of
+
+FRAMES_PER_KEYFRAME = 14
+"""About as many as simulated robots have."""
+
+
+@dataclass(frozen=True)
+class PredictedTime:
+    """What some experiments take.
+
+    Attributes:
+        runs: that their rules ask for.
+        different: of them; the others are found in the store.
+        cpu_s: processor time of these, without simulating the recordings, which are few.
+    """
+
+    runs: int
+    different: int
+    cpu_s: float
+
+
+def predicted_time(experiments: Sequence[Experiment], profile: str) -> PredictedTime:
+    """What experiments take that share a store, on the machine that `cache.durations` was fitted on.
+
+    Args:
+        experiments: the experiments.
+        profile: name of how much is computed.
+    """
+    runs, different = 0, dict[tuple[str, ...], float]()
+    for experiment in experiments:
+        chosen = experiment.profile(profile)
+        for name in experiment.file.configurations:
+            data = data_of(experiment.file, chosen, name)
+            config = load_config(RunConfig, None, config_of(experiment.file, chosen, name))
+            whole, images = config.model_dump_json(), config.frontend.model_dump_json()
+            front_s, rest_s = _times(data, config)
+            for seed in chosen.seeds:
+                recording = (data.model_dump_json(), str(seed))
+                runs += 1
+                different["run", *recording, whole] = rest_s
+                different["front end", *recording, images] = front_s
+    count = sum(key[0] == "run" for key in different)
+    return PredictedTime(runs, count, sum(different.values()))
+
+
+def _times(data: SimulatedData, config: RunConfig) -> tuple[float, float]:
+    """Of the front ends of a run, and of all that comes after them."""
+    keyframes = 1 + data.frames // FRAMES_PER_KEYFRAME
+    size = {"frames": data.frames, "pixels": data.width * data.height, "keyframes": keyframes}
+    front_s = durations.front_end_s(size, config.frontend.mapping) + durations.information_s(size)
+    rest_s = durations.exchange_s([size] * data.robots)
+    rest_s += data.robots * (durations.fusion_s(size) + durations.evaluation_s(size, data.robots))
+    return data.robots * front_s, rest_s
