@@ -103,6 +103,8 @@ class ExchangeConfig(Config):
     evidence_order: EvidenceOrder = "gain"
     """Which Gaussians go first: those that promise the receiver most information per byte, or by the paper's (4); to
     compare with, a random order, and the reversed one of `gain`."""
+    evidence_share: float = Field(default=1.0, gt=0.0, le=1.0)
+    """Share of its Gaussians that a robot sends evidence of, the first of this order; the others stay with it."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
     link: LinkConfig = LinkConfig()

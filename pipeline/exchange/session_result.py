@@ -45,7 +45,7 @@ def result_of(agent: MapAgent) -> SessionResult:
         evidence={name: to_evidence(name, records) for name, records in evidence.items()},
         # a robot that sent no kind of depth sent no Gaussian either: nothing of it is rendered
         depth_of={name: depths[name] or agent.data.depth for name in evidence},
-        arrived={team[i]: knowledge.share(i) for i in others if i in placed},
+        arrived={team[i]: agent.config.evidence_share * knowledge.share(i) for i in others if i in placed},
         pairs=_pairs(agent, placed),
         closures=tuple(_closures(agent)),
         agreed=agent.agreed or not others,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -93,11 +94,15 @@ class Sharing:
             self._records = evidence_wire.from_body(self.kind, self.own_body())
         return self._records
 
+    def _sent(self) -> slice:
+        """Which of the own records others get."""
+        return slice(math.ceil(self.config.evidence_share * len(self.own_body())))
+
     def _own_evidence(self) -> bytes:
         k = self.knowledge
         if self.own not in k.evidence_bytes:
             k.evidence_bytes[self.own] = evidence_wire.write_evidence(
-                self.kind, self.own, self.data.depth, self.own_body()
+                self.kind, self.own, self.data.depth, self.own_body()[self._sent()]
             )
         return k.evidence_bytes[self.own]
 
@@ -248,7 +253,8 @@ class Sharing:
         if n.voxels is None or T_world_map is None:
             return None
         if owner == self.own:
-            records, body, depth = self.own_records(), self.own_body(), self.data.depth
+            sent, depth = self._sent(), self.data.depth
+            records, body = self.own_records()[sent], self.own_body()[sent]
             T_common = T_world_map @ self.data.T_map_keyframe
         elif owner in k.anchors and (kind := k.depth(owner)) is not None:
             records, body, depth = k.evidence[owner], k.bodies[owner], kind
@@ -319,7 +325,7 @@ class Sharing:
     def _placed(self, poses: Anchors) -> tuple[str, NDArray[Any], Array]:
         """Name of a robot, what is here of its evidence, and its poses."""
         own = poses.owner == self.own
-        records = self.own_records() if own else self.knowledge.sound_records(poses)
+        records = self.own_records()[self._sent()] if own else self.knowledge.sound_records(poses)
         return self.team[poses.owner], records, poses.T_common_keyframe
 
     def match(self, others: Sequence[int]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,22 @@ def test_the_printed_order_of_evidence_depends_on_the_unit_of_length(team: Team)
         assert np.array_equal(np.sort(order), np.arange(len(records)))
     value = paper_priority(records)[by_paper[0]]
     assert np.all(np.diff(value) <= 0)
+
+
+def test_a_share_of_the_evidence_is_the_first_of_its_order(team: Team, tmp_path: Path) -> None:
+    """What stays with its owner is known to nobody else, and is matched with nothing."""
+    half = meet(team, 2, tmp_path, evidence_share=0.5)
+    for robot, peer in (NAMES[:2], NAMES[1::-1]):
+        records = own_records(team[peer][0], Kind.EVIDENCE, ExchangeConfig().weights)
+        first = records[order_of_sending(records, "gain", 0, peer)][: math.ceil(len(records) / 2)]
+        here = half[robot].evidence[peer].ids
+        assert np.array_equal(np.sort(here), np.sort(first["id"]))
+        assert len(half[peer].own_evidence.ids) == len(records) > len(here)
+        assert half[robot].arrived == {peer: 0.5}
+    (pairs,) = half["alpha"].pairs.values()
+    for ids, owner, other in zip(np.asarray(pairs).T, NAMES, NAMES[1::-1], strict=False):
+        assert len(ids)
+        assert set(ids.tolist()) <= set(half[other].evidence[owner].ids.tolist())
 
 
 def test_two_sessions_are_the_same_bit_for_bit(team: Team, tmp_path: Path) -> None:
