@@ -32,7 +32,7 @@ BUDGET_S = {
     "evaluation": 10,
     "examples": 15,
     "exchange": 33,
-    "experiments": 2,
+    "experiments": 3,
     "frontend": 64,
     "fusion": 2,
     "fuzz": 10,

@@ -20,6 +20,7 @@ from duagc.pipeline.batch.cell import read_state, run_folder
 from duagc.pipeline.batch.engines import Engine
 from duagc.pipeline.batch.results import gather
 from duagc.pipeline.batch.suite import BatchCell, Suite, read_suite
+from duagc.pipeline.cache.code_identity import CodeReader
 from duagc.pipeline.config import packages
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
@@ -29,6 +30,7 @@ from duagc.pipeline.experiments.rule import Experiment, Profile, SimulatedData, 
 from duagc.pipeline.experiments.statistics import mean
 from duagc.pipeline.experiments.verdicts import ResultRow
 from duagc.pipeline.recording import Recording
+from duagc.pipeline.runs import stages
 
 RESULT, SUITE, RECORDINGS = "result.json", "suite.toml", "recordings"
 SIMULATED = "seed_"  # in front of the names of simulated recordings
@@ -255,6 +257,7 @@ def carry_out(
     document = {
         "experiment": experiment.name,
         "rule_sha256": experiment.sha256,
+        "code_sha256": code_digest(store),
         "profile": profile,
         "seeds": list(chosen.seeds),
         "recordings": list(recordings),
@@ -263,6 +266,20 @@ def carry_out(
     with new_file(folder / RESULT) as part:
         part.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return [name for name in suite.cells if name not in done]
+
+
+def code_digest(store: Path) -> str:
+    """Digest of the stages up to the evaluation, with all that they import and the kernels as they are built here.
+
+    Every run of an experiment is of this code: those of other code are not taken from the store.
+
+    Args:
+        store: of what was computed before, which remembers digests.
+    """
+    reader, modules = CodeReader(store / "code.json"), dict[str, str]()
+    for stage in stages.STAGES[: 1 + stages.STAGES.index(stages.EVALUATION)]:
+        modules |= reader.version_of(stage.code).modules
+    return hashlib.sha256(json.dumps(modules, sort_keys=True).encode()).hexdigest()
 
 
 def _row(experiment: Experiment, cell: BatchCell, folder: Path, numbers: Mapping[str, object]) -> ResultRow:

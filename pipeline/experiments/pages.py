@@ -85,9 +85,10 @@ def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
     sections = [_section(one) for one in judged]
     for one, section in zip(judged, sections, strict=True):
         _write(out / one.experiment.name / FIGURE, section["figure"])
-    package = "duagc.pipeline.experiments"
-    _write(out / PAGE, filled(package, "page.html.j2", title="Experiments", sections=sections))
-    _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, sections=sections))
+    package, mixed = "duagc.pipeline.experiments", len({section["code"] for section in sections}) > 1
+    page = filled(package, "page.html.j2", title="Experiments", sections=sections, mixed=mixed)
+    _write(out / PAGE, page)
+    _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, sections=sections, mixed=mixed))
     verdicts = {one.experiment.name: [_document(v) for v in one.verdicts] for one in judged}
     _write(out / VERDICTS, json.dumps(verdicts, indent=2, allow_nan=False) + "\n")
     write_costs(out, [one.experiment.name for one in judged])
@@ -123,6 +124,9 @@ def _section(one: JudgedExperiment) -> dict[str, Any]:
         "claim": file.claim,
         "limits": file.limits,
         "sha256": one.experiment.sha256,
+        "code": f"code `{one.result['code_sha256'][:12]}`"
+        if "code_sha256" in one.result
+        else "code not recorded",
         "profile": profile,
         "level": f"{file.level:g}",
         "seeds": ", ".join(map(str, one.result["seeds"])),

@@ -16,6 +16,7 @@ from duagc.pipeline.experiments.carry_out import (
     SUITE,
     carry_out,
     check_place,
+    code_digest,
     prepare,
     recording_folder,
 )
@@ -124,6 +125,24 @@ def test_the_page_says_the_verdict_and_repeats_to_the_last_byte(place: Path) -> 
     assert "duagc experiment run mine --profile small --out DIR" in page
     assert "This experiment has no control." in page
     assert json.loads(before[2])["mine"][0]["mean"] == pytest.approx(-0.0001)
+
+
+def test_the_page_says_where_sections_are_of_different_code(place: Path, tmp_path: Path) -> None:
+    result = json.loads((place / "out" / "mine" / RESULT).read_text())
+    assert result["code_sha256"] == code_digest(place / "store")
+    other = {"same": result, "older": {k: v for k, v in result.items() if k != "code_sha256"}}
+    pages = {}
+    for name, twin in other.items():
+        for file, document in (("mine", result), ("twin", twin)):
+            (tmp_path / name / file).mkdir(parents=True)
+            (tmp_path / name / file / RESULT).write_text(json.dumps(document))
+            shutil.copy(place / "rules" / "mine.toml", tmp_path / f"{file}.toml")
+        write_report(tmp_path / name, judge_folder(tmp_path / name, tmp_path))
+        pages[name] = (tmp_path / name / MARKDOWN).read_text()
+    assert pages["same"].count(f"code `{result['code_sha256'][:12]}`") == 2
+    assert "Not all sections" not in pages["same"]
+    assert "**Not all sections are of the same code**" in pages["older"]
+    assert "; code not recorded." in pages["older"]
 
 
 def test_a_result_under_another_rule_is_refused(place: Path, tmp_path: Path) -> None:
