@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from duagc.pipeline.cache import durations
 from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.experiments.rule import Experiment, SimulatedData, config_of, data_of
 
@@ -59,5 +60,15 @@ def _times(data: SimulatedData, config: RunConfig) -> tuple[float, float]:
     size = {"frames": data.frames, "pixels": data.width * data.height, "keyframes": keyframes}
     front_s = durations.front_end_s(size, config.frontend.mapping) + durations.information_s(size)
     rest_s = durations.exchange_s([size] * data.robots)
-    rest_s += data.robots * (durations.fusion_s(size) + durations.evaluation_s(size, data.robots))
+    rest_s += data.robots * (_fusion_s(size, config) + durations.evaluation_s(size, data.robots))
     return data.robots * front_s, rest_s
+
+
+def _fusion_s(size: durations.Size, config: RunConfig) -> float:
+    """Of a robot; `durations` knows the views and steps of the defaults alone."""
+    mine, usual = config.fusion.finetune, RunConfig().fusion.finetune
+    others = size["frames"] - size["keyframes"]
+    views = size["keyframes"] + min(mine.support_views, others)
+    share = views / (size["keyframes"] + min(MappingConfig().support_views, others))
+    trained_s = durations.fusion_s(size) - durations.FUSION_S
+    return durations.FUSION_S + trained_s * share * mine.steps_per_view / usual.steps_per_view
