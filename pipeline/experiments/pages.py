@@ -85,7 +85,8 @@ def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
     sections = [_section(one) for one in judged]
     for one, section in zip(judged, sections, strict=True):
         _write(out / one.experiment.name / FIGURE, section["figure"])
-    package, mixed = "duagc.pipeline.experiments", len({section["code"] for section in sections}) > 1
+    codes = {one.result.get("code_sha256") for one in judged}
+    package, mixed = "duagc.pipeline.experiments", len(codes) > 1 or None in codes
     page = filled(package, "page.html.j2", title="Experiments", sections=sections, mixed=mixed)
     _write(out / PAGE, page)
     _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, sections=sections, mixed=mixed))

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from duagc.pipeline.experiments.carry_out import (
 )
 from duagc.pipeline.experiments.pages import MARKDOWN, PAGE, VERDICTS, judge_folder, write_report
 from duagc.pipeline.experiments.rule import read_experiment
+from duagc.pipeline.runs import stages
 from tests.experiments.test_rules import FILE
 from tests.fixtures import fake_run
 
@@ -69,17 +71,26 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _carry_out(root: Path, engine: Measured) -> list[str]:
+    """Of a pipeline of one small stage, whose code is quickly read."""
     said: list[str] = []
-    carry_out(
-        read_experiment("mine", root / "rules"),
-        "small",
-        root / "out",
-        recordings={},
-        engine=engine,
-        store=root / "store",
-        log=said.append,
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        _only_stage(patch, "closest")
+        carry_out(
+            read_experiment("mine", root / "rules"),
+            "small",
+            root / "out",
+            recordings={},
+            engine=engine,
+            store=root / "store",
+            log=said.append,
+        )
     return said
+
+
+def _only_stage(patch: pytest.MonkeyPatch, function: str) -> None:
+    only = replace(stages.EVALUATION, code=f"duagc.pipeline.base.errors:{function}")
+    patch.setattr(stages, "EVALUATION", only)
+    patch.setattr(stages, "STAGES", (only, stages.REPORT))
 
 
 def test_every_seed_has_its_own_recording_and_run(place: Path) -> None:
@@ -127,9 +138,14 @@ def test_the_page_says_the_verdict_and_repeats_to_the_last_byte(place: Path) -> 
     assert json.loads(before[2])["mine"][0]["mean"] == pytest.approx(-0.0001)
 
 
-def test_the_page_says_where_sections_are_of_different_code(place: Path, tmp_path: Path) -> None:
+def test_the_page_says_where_sections_are_of_different_code(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result = json.loads((place / "out" / "mine" / RESULT).read_text())
+    _only_stage(monkeypatch, "closest")
     assert result["code_sha256"] == code_digest(place / "store")
+    _only_stage(monkeypatch, "DuagError")
+    assert result["code_sha256"] != code_digest(place / "store")
     other = {"same": result, "older": {k: v for k, v in result.items() if k != "code_sha256"}}
     pages = {}
     for name, twin in other.items():
@@ -141,7 +157,7 @@ def test_the_page_says_where_sections_are_of_different_code(place: Path, tmp_pat
         pages[name] = (tmp_path / name / MARKDOWN).read_text()
     assert pages["same"].count(f"code `{result['code_sha256'][:12]}`") == 2
     assert "Not all sections" not in pages["same"]
-    assert "**Not all sections are of the same code**" in pages["older"]
+    assert "**Not all sections are known to be of the same code**" in pages["older"]
     assert "; code not recorded." in pages["older"]
 
 
