@@ -45,9 +45,11 @@ class MappingConfig(Config):
     """How the map is grown and optimized."""
 
     max_gaussians: int = 60_000
-    """Hard cap of a tile's own Gaussians; with those of others that it sees, of twice as many. When a keyframe would
-    exceed it, the Gaussians whose removal changes the keyframes least go first."""
-    tile_keyframes: int = Field(default=64, ge=2)
+    """Hard cap of a tile's own Gaussians. When a keyframe would exceed it, the Gaussians whose removal changes the
+    keyframes least go first."""
+    seen_gaussians: int = 600_000
+    """Most Gaussians of all tiles that the keyframes of a tile see; half of its own cap is there in any case."""
+    tile_keyframes: int = Field(default=40, ge=2)
     """Most keyframes of a tile: a longer log has a map of several, each optimized with the images of its keyframes."""
     border_keyframes: int = Field(default=24, ge=0)
     """Most keyframes of other tiles that look into a tile whose images take part in its optimization."""

@@ -14,9 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.geometry.view_extent import radii_m
 from duagc.pipeline.kernels import CompiledAdam, Gradients
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.optimizer import TRAINED
 
+Indices = NDArray[np.int64]
+TakeStep = Callable[[Gaussians, Gradients, CompiledAdam], Gaussians]
 FADING = 0.9
 """Share of its last contribution that a Gaussian keeps where it is not measured again."""
 
@@ -31,6 +35,7 @@ class GrowingMap:
         next_id: of the next Gaussian that is made.
         guests: the first so many Gaussians belong to other tiles of the map.
         uncounted: guests that count for no cap.
+        guests_begun: centers [m, 3] and radii [m], meters, that the guests had when the tile was taken out.
     """
 
     def __init__(self, config: MappingConfig, *, threads: int = 1) -> None:
@@ -46,6 +51,7 @@ class GrowingMap:
         self.contribution = np.zeros(0)
         self.next_id = 0
         self.guests = self.uncounted = 0
+        self.guests_begun = _balls(self.gaussians)
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -53,7 +59,7 @@ class GrowingMap:
     def state(self) -> tuple[Any, ...]:
         """All that it knows; `go_on` takes it."""
         counts = self.next_id, self.guests, self.uncounted
-        return self.gaussians, self.contribution, counts, self.adam.state()
+        return self.gaussians, self.contribution, counts, self.guests_begun, self.adam.state()
 
     def go_on(self, state: tuple[Any, ...]) -> None:
         """Go on from where another one was.
@@ -61,7 +67,7 @@ class GrowingMap:
         Args:
             state: of that one.
         """
-        self.gaussians, self.contribution, counts, adam = state
+        self.gaussians, self.contribution, counts, self.guests_begun, adam = state
         self.next_id, self.guests, self.uncounted = counts
         self.adam.go_on(adam)
 
@@ -77,9 +83,8 @@ class GrowingMap:
 
     @property
     def _own_cap(self) -> int:
-        """Most own Gaussians: the configured cap, as long as all that the views see is at most twice that."""
-        most, counted = self.config.max_gaussians, self.guests - self.uncounted
-        return min(most, 2 * most - counted)
+        """Most own Gaussians: the configured cap, as long as all that the views see is not too much."""
+        return min(self.config.max_gaussians, self.config.seen_gaussians - (self.guests - self.uncounted))
 
     def take(self, guests: NDArray[np.int64], own: NDArray[np.int64], uncounted: int) -> GrowingMap:
         """Take Gaussians out, into a map of their own, where new ones are made.
@@ -108,12 +113,14 @@ class GrowingMap:
         self.contribution = np.concatenate([self.contribution, part.contribution])
         self.adam.append(part.adam)
 
-    def _selected(self, rows: NDArray[np.int64], counts: tuple[int, int, int]) -> tuple[Any, ...]:
+    def _selected(self, rows: Indices, counts: tuple[int, int, int]) -> tuple[Any, ...]:
         """The state of a map of some of the Gaussians."""
         adam = CompiledAdam(threads=self.adam.threads)
         adam.append(self.adam)
         adam.select(rows)
-        return self.gaussians.select(rows), self.contribution[rows], counts, adam.state()
+        gaussians = self.gaussians.select(rows)
+        begun = _balls(gaussians.select(slice(counts[1])))
+        return gaussians, self.contribution[rows], counts, begun, adam.state()
 
     def append(self, new: Gaussians) -> None:
         """Add Gaussians, whose contribution is not measured yet.
@@ -160,26 +167,41 @@ class GrowingMap:
         huge = self.gaussians.log_scales.max(axis=1, initial=-np.inf) > np.log(config.max_scale_m)
         return self.keep((self.gaussians.opacity_logits >= logit) & ~huge | self.is_guest)
 
-    def step_own(
-        self, gradients: Gradients, take: Callable[[Gaussians, Gradients, CompiledAdam], Gaussians]
-    ) -> None:
-        """Take an optimization step of all Gaussians but guests, in place.
+    def seen_with(self, guests: Indices) -> Gaussians:
+        """Some guests, and all own Gaussians after them.
 
         Args:
-            gradients: of a loss by all Gaussians.
-            take: gives the own ones after the step, from them, their gradients and the state of their optimizer.
+            guests: rows [m] of the guests.
         """
-        own = slice(self.guests, None)
-        first, second, steps, corrections = self.adam.state()
-        adam = CompiledAdam(threads=self.adam.threads)  # on the same memory
-        parts = (
-            {name: moments[own] for name, moments in moments_of.items()} for moments_of in (first, second)
-        )
-        adam.go_on((*parts, steps[own], corrections))
-        of_own = {name: getattr(gradients, name)[own] for name in first}
-        stepped = take(self.gaussians.select(own), replace(gradients, **of_own), adam)
-        for name in first:
-            getattr(self.gaussians, name)[own] = getattr(stepped, name)
+        return Gaussians.concatenate([self.gaussians.select(rows) for rows in (guests, self._own)])
+
+    def step(self, guests: Indices, gradients: Gradients, take: TakeStep, *, keep_guests: bool) -> None:
+        """Take an optimization step of what a view may see, in place.
+
+        Args:
+            guests: rows [m] of the guests that it may see.
+            gradients: of a loss by `seen_with(guests)`.
+            take: gives Gaussians after the step, from them, their gradients and the state of their optimizer.
+            keep_guests: whether guests stay as they are.
+        """
+        count = len(guests)
+        self._step_of(self._own, gradients, slice(count, None), take)
+        if count and not keep_guests:
+            self._step_of(guests, gradients, slice(count), take)
+
+    @property
+    def _own(self) -> slice:
+        return slice(self.guests, None)
+
+    def _step_of(self, rows: slice | Indices, gradients: Gradients, part: slice, take: TakeStep) -> None:
+        """Take a step of some rows, of which a part of the gradients is."""
+        adam = self.adam.part(rows)
+        of_rows = {name: np.ascontiguousarray(getattr(gradients, name)[part]) for name in TRAINED}
+        stepped = take(self.gaussians.select(rows), replace(gradients, **of_rows), adam)
+        for name in TRAINED:
+            getattr(self.gaussians, name)[rows] = getattr(stepped, name)
+        if not isinstance(rows, slice):
+            self.adam.put(rows, adam)
 
     @property
     def is_guest(self) -> NDArray[np.bool_]:
@@ -200,3 +222,8 @@ class GrowingMap:
             self.adam.select(mask)
             self.contribution = self.contribution[mask]
         return int(np.count_nonzero(~mask))
+
+
+def _balls(gaussians: Gaussians) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Centers [n, 3] and radii [n] of Gaussians, meters."""
+    return gaussians.means.copy(), radii_m(gaussians.log_scales)

@@ -24,12 +24,13 @@ from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.output import BuiltMap, Maps
 from duagc.pipeline.frontend.tile_checkpoints import TileCheckpoints
-from duagc.pipeline.frontend.tiles import ViewExtent, border_keyframes, make_tiles, take_tile
+from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_tile
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration.moving import FreeSpace

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.contributions import contributions
-from duagc.pipeline.frontend.growing_map import GrowingMap
+from duagc.pipeline.frontend.growing_map import GrowingMap, Indices
 from duagc.pipeline.frontend.mapping_views import Image, View
 from duagc.pipeline.frontend.view_selection import covisible
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.kernels import Rasterizer, Render
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
@@ -93,9 +94,20 @@ class MapContent:
         """
         self._map = begun
 
+    def _seen(self, view: View) -> Gaussians:
+        """What a view may see of other tiles, and all that is the tile's own."""
+        return self._map.seen_with(self._guests(view)) if self._map.guests else self._map.gaussians
+
+    def _guests(self, view: View) -> Indices:
+        """Rows of the guests that a view may see, by where they and the view were when the tile was begun."""
+        if view.guests is None:
+            sight = ViewExtent.of(view.depth_m, self.cameras[0])
+            view.guests = np.flatnonzero(sight.sees(*self._map.guests_begun, view.T_map_begun))
+        return view.guests
+
     def _draw(self, view: View) -> Render:
         T_camera_map = se3.inverse(view.T_map_camera)
-        return self.rasterizer.forward(self.gaussians, self.cameras[0], T_camera_map, depth_kind=self.depth)
+        return self.rasterizer.forward(self._seen(view), self.cameras[0], T_camera_map, depth_kind=self.depth)
 
     def _seed(self, view: View, share: float) -> tuple[int, int]:
         """Insert discs for what the map does not explain of a view; numbers of inserted and pruned Gaussians."""

@@ -294,7 +294,7 @@ class Mapper(MapContent):
         return self._view_gradients(view, level)[0].value
 
     def _view_gradients(self, view: View, level: int) -> tuple[ViewLoss, Gradients]:
-        return self._step.gradients(self._map.gaussians, self.cameras[level], view.training(level))
+        return self._step.gradients(self._seen(view), self.cameras[level], view.training(level))
 
     def _mean_loss(self) -> float:
         return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
@@ -311,7 +311,7 @@ class Mapper(MapContent):
     ) -> float:
         """One Adam step of the Gaussians in one view, and of its pose where a step is given; the loss before."""
         loss, gradients = self._step.gradients(
-            self._map.gaussians,
+            self._seen(view),
             self.cameras[level],
             looked_at.of(view.training(level)),
             pose=pose_step is not None,
@@ -319,8 +319,8 @@ class Mapper(MapContent):
         )
         least = np.float32(np.log(self.config.seeding.thickness_m))
         take = partial(self._stepped, rates=rates, least_log_scales=least)
-        if keep_guests and self._map.guests:
-            self._map.step_own(gradients, take)
+        if self._map.guests:
+            self._map.step(self._guests(view), gradients, take, keep_guests=keep_guests)
         else:
             self._map.gaussians = take(self._map.gaussians, gradients, self._map.adam)
         if pose_step is not None:

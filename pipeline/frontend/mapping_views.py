@@ -36,6 +36,8 @@ class View:
         half_certainty: at half size.
         exposure: of the image; None = as the map.
         information: [6, 6] of the pose, by tracking (right tangent: translation m, rotation rad).
+        T_map_begun: [4, 4], the pose before it was refined.
+        guests: rows of the Gaussians of other tiles that it may see; None = not looked for.
     """
 
     index: int
@@ -52,6 +54,8 @@ class View:
     half_certainty: Image | None = None
     exposure: Exposure | None = None
     information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
+    T_map_begun: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    guests: NDArray[np.int64] | None = None
 
     @classmethod
     def of(
@@ -102,6 +106,7 @@ class View:
             half_certainty=None if certainty is None else halve(certainty),
             exposure=exposure,
             information=np.zeros((6, 6)) if information is None else information,
+            T_map_begun=np.array(T_map_camera, dtype=np.float64),
         )
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.kernels import _raster
@@ -42,6 +43,31 @@ class CompiledAdam(Adam):
         arguments = (*arrays, step_lengths, _CONSTANTS, *touched_by, *state, self.threads)
         _raster.adam(self.isa, *arguments)
         return gaussians.replace(**dict(zip(names, out, strict=True)))
+
+    def part(self, rows: slice | NDArray[np.int64]) -> CompiledAdam:
+        """The state of some Gaussians: of a slice on the same memory, of indices a copy.
+
+        Args:
+            rows: of the Gaussians.
+        """
+        part = CompiledAdam(isa=self.isa, threads=self.threads)
+        first, second = (
+            {name: of[rows] for name, of in all_of.items()} for all_of in (self._first, self._second)
+        )
+        part.go_on((first, second, self._steps[rows], self._corrections))
+        return part
+
+    def put(self, rows: NDArray[np.int64], part: CompiledAdam) -> None:
+        """Take back the state of some Gaussians.
+
+        Args:
+            rows: of the Gaussians, as of `part`.
+            part: that `part` gave, some steps later.
+        """
+        first, second, steps, _ = part.state()
+        for name in first:
+            self._first[name][rows], self._second[name][rows] = first[name], second[name]
+        self._steps[rows] = steps
 
 
 def _check_gradient(name: str, gradient: object, shape: tuple[int, ...]) -> None:

@@ -18,6 +18,8 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "colors": (3,),
     "opacity_logits": (),
 }
+TRAINED = tuple(_SHAPES)
+"""What is optimized of a Gaussian."""
 BETA_1, BETA_2, EPSILON = 0.9, 0.99, 1e-12
 _LONGEST = 1024  # steps after which both bias corrections are 1 within float32
 

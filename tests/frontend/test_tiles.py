@@ -8,8 +8,9 @@ import pytest
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping import Mapper
-from duagc.pipeline.frontend.tiles import ViewExtent, border_keyframes, make_tiles, take_tile
+from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_tile
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
 from duagc.pipeline.kernels.training import TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -29,6 +30,7 @@ def test_every_keyframe_is_in_one_tile_with_its_neighbors() -> None:
     far = next(tile for tile in tiles if 1 in tile)
     assert {k % 3 for k in far} <= {1, 2} or len(far) > 6
     assert make_tiles(centers, 36) == [list(range(36))]
+    assert [len(tile) for tile in make_tiles(centers, 14)] == [12] * 3
 
 
 def test_the_border_looks_into_the_tile_from_all_sides() -> None:
@@ -149,32 +151,38 @@ def test_tiles_are_drawn_as_well_as_one_map_with_the_same_bits_whatever_the_thre
     assert same(tiled.gaussians, _tiled(config, ([0, 1], [2, 3]), threads=3).gaussians)
 
 
-def test_a_step_of_the_own_gaussians_is_that_of_all_where_guests_have_no_gradient() -> None:
+@pytest.mark.parametrize("keep_guests", [True, False])
+def test_a_step_of_what_a_view_sees_is_that_of_all(keep_guests: bool) -> None:
     config, step, least = (
         QUICK,
         TrainingStep(Rasterizer(), LossWeights(0.1, 1.0, 0.02, 0.04), "blended"),
         np.float32(-7.0),
     )
     maps = [take_tile(_grown(2), [1], _sights([1]), []) for _ in range(2)]
-    assert 0 < maps[0].guests < len(maps[0])
     view = TrainingView(shot(POSES[1])[0].astype(np.float32) / 255, shot(POSES[1])[1], POSES[1])
+    part, count = maps[0], maps[0].guests
+    seen = np.flatnonzero((step.gradients(part.gaussians, CAMERA, view)[1].colors[:count] != 0).any(axis=1))
+    assert 0 < len(seen) < count < len(part)
 
     def take(gaussians: Gaussians, gradients: Gradients, adam: CompiledAdam) -> Gaussians:
         return step.stepped(gaussians, gradients, adam=adam, rates=config.rates, least_log_scales=least)
 
     for _ in range(3):
-        _, gradients = step.gradients(maps[0].gaussians, CAMERA, view)
-        maps[0].step_own(gradients, take)
+        _, gradients = step.gradients(part.seen_with(seen), CAMERA, view)
+        part.step(seen, gradients, take, keep_guests=keep_guests)
         _, gradients = step.gradients(maps[1].gaussians, CAMERA, view)
         for array in (gradients.colors, gradients.opacity_logits):
-            array[: maps[1].guests] = 0
+            array[: count if keep_guests else 0] = 0
         maps[1].gaussians = take(maps[1].gaussians, gradients, maps[1].adam)
-    assert same(maps[0].gaussians, maps[1].gaussians)
-    assert not same(maps[0].gaussians, take_tile(_grown(2), [1], _sights([1]), []).gaussians)
+    assert same(part.gaussians, maps[1].gaussians)
+    assert all(np.array_equal(a, b) for a, b in zip(*(m.adam.state()[1].values() for m in maps), strict=True))
+    begun = take_tile(_grown(2), [1], _sights([1]), []).gaussians
+    assert same(part.gaussians.select(slice(count)), begun.select(slice(count))) == keep_guests
+    assert not same(part.gaussians.select(slice(count, None)), begun.select(slice(count, None)))
 
 
 def test_guests_leave_room_for_what_a_tile_adds() -> None:
-    config = QUICK.model_copy(update={"max_gaussians": 100})
+    config = QUICK.model_copy(update={"max_gaussians": 100, "seen_gaussians": 200})
     crowded = GrowingMap(config)
     crowded.append(_grown(1).gaussians)
     guests = len(crowded)
@@ -186,6 +194,6 @@ def test_guests_leave_room_for_what_a_tile_adds() -> None:
     assert part.prune_least(10) == 0  # there are only guests
     part.put_back(crowded)
     part = part.take(np.arange(guests), none, uncounted=guests - 120)
-    assert (part.cap, part.room) == (guests + 80, 80)  # twice the cap, all that views see
+    assert (part.cap, part.room) == (guests + 80, 80)  # 200, all that views see
     free = part.take(np.arange(guests), none, uncounted=guests)
     assert (free.cap, free.room) == (guests + 100, 100)
