@@ -11,6 +11,8 @@ from duagc.pipeline.config.training import LearningRates, MapLossConfig, SparseS
 class FinetuneConfig(Config):
     """Finetuning of the fused map on the robot's own images and on renders of its peers' maps."""
 
+    keyframes: int = Field(default=40, ge=1)
+    """Own keyframes up to which steps and views are at most those below; of a longer log, in proportion more."""
     steps_per_view: int = Field(default=8, ge=0)
     """Steps for each own view; 0: the fused map stays as fusion left it."""
     steps_max: int = Field(default=600, ge=0)
@@ -28,6 +30,15 @@ class FinetuneConfig(Config):
     sparse: SparseStepsConfig = SparseStepsConfig()
     rates: LearningRates = LearningRates()
     loss: MapLossConfig = MapLossConfig()
+
+    def at_most(self, count: int, keyframes: int) -> int:
+        """A number of steps or views, of a longer log in proportion more.
+
+        Args:
+            count: of a log with `keyframes` of the configuration.
+            keyframes: of the log.
+        """
+        return count * max(keyframes, self.keyframes) // self.keyframes
 
 
 class PeerValidationConfig(Config):

@@ -50,10 +50,10 @@ def _trained(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -
     own = robot.own_map
     with open_rgbd(log) as camera_log:
         camera = camera_log.camera
-    views = training_views(
-        files, frames, poses, num_support=config.support_views, moving=run.config.frontend.moving
-    )
-    steps = sum(num_steps(config, len(views), 1))
+    keyframes = len(robot.keyframes)
+    num_support = config.at_most(config.support_views, keyframes)
+    views = training_views(files, frames, poses, num_support=num_support, moving=run.config.frontend.moving)
+    steps = sum(num_steps(config, len(views), 1, keyframes))
     context = MapContext(
         camera,
         FusionConfig(finetune=config.model_copy(update={"steps_per_view": steps, "steps_max": steps})),
@@ -62,4 +62,4 @@ def _trained(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -
         threads=threads,
         seed=run.config.seed,
     )
-    return finetune_map(own.gaussians, views, context)
+    return finetune_map(own.gaussians, views, context, keyframes=keyframes)

@@ -22,30 +22,32 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.fusion import FinetuneConfig
+from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
-from duagc.pipeline.kernels.sparse_steps import SparseSteps
+from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.losses import depth_certainty
-from duagc.pipeline.splat.optimizer import smoothstep_decay
+from duagc.pipeline.splat.optimizer import TRAINED, smoothstep_decay
 
 PEERS_UNTIL = 0.6
 """Share of the steps after which only own images are used."""
 PART = "training"
-_TRAINED = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
 
-def num_steps(config: FinetuneConfig, own_views: int, peer_views: int) -> tuple[int, int]:
+def num_steps(config: FinetuneConfig, own_views: int, peer_views: int, keyframes: int = 0) -> tuple[int, int]:
     """How many steps the training takes on own views and on views of peers' maps.
 
     Args:
         config: schedule.
         own_views: how many there are.
         peer_views: how many there are.
+        keyframes: of the robot.
     """
-    steps = min(config.steps_per_view * own_views, config.steps_max)
+    steps = min(config.steps_per_view * own_views, config.at_most(config.steps_max, keyframes))
     return steps, round(config.peer_share * steps) if peer_views else 0
 
 
@@ -56,12 +58,13 @@ def finetune_map(
     *,
     trained: NDArray[np.bool_] | None = None,
     peer_views: Sequence[PosedRgbd] = (),
+    keyframes: int = 0,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> Gaussians:
     """The map after some training steps, each on one view.
 
     Own views come in random order, each once before any comes again; peer views likewise, evenly spread among the
-    first steps.
+    first steps. Of a long log a step takes only what its view may see (`map_cells`).
 
     Args:
         gaussians: in the world frame of the views.
@@ -69,53 +72,103 @@ def finetune_map(
         context: camera and settings; `config.finetune` is the schedule.
         trained: bool [n], which of the Gaussians may change; None: all.
         peer_views: as peers' maps show them.
+        keyframes: of the robot: of a longer log there are more steps.
         checkpoints: of the stage.
     Returns:
         As many Gaussians, in the same order, with the same ids and anchors.
     """
     config = context.config.finetune
-    own_steps, peer_steps = num_steps(config, len(views), len(peer_views))
+    own_steps, peer_steps = num_steps(config, len(views), len(peer_views), keyframes)
     if not own_steps or not len(gaussians):
         return gaussians
     total = own_steps + peer_steps
     head = max(peer_steps, round(PEERS_UNTIL * total))
-    weights = LossWeights(**config.loss.of(context.depth_kind).model_dump())
-    take_step = TrainingStep(Rasterizer(threads=context.threads), weights, context.depth_kind)
-    adam = CompiledAdam(len(gaussians), threads=context.threads)
-    floor_m = context.matching.thickness_floor_m
-    floor = np.minimum(gaussians.log_scales, np.float32(np.log(floor_m)))  # thinner ones stay as they are
+    training = _Training(gaussians, context, trained, in_parts=keyframes > config.keyframes)
     # the streams keep the names that they had: under other names they would draw other views
     own = _in_turn(views, context.seed, "fusion.refine")
     peer = _in_turn(peer_views, context.seed, "fusion.refine.peers")
     sparse = SparseSteps(config.sparse, context.camera, total)
     first = 0
     if (saved := checkpoints.resume(PART)) is not None:
-        first, (gaussians, state) = saved
-        adam.go_on(state)
+        first, state = saved
+        training.go_on(state)
     for step in range(total):
         of_peer = step < head and (step + 1) * peer_steps // head > step * peer_steps // head
         view, visit = next(peer if of_peer else own)
         if step < first:
             continue  # its view was taken by the process before
         share = config.rate * smoothstep_decay(step, total, config.rate_decay)
-        looked_at = sparse.at(step, visit)
-        stepped, _ = take_step(
+        training.step(view, sparse.at(step, visit), config.rates.times(share))
+        checkpoints.at(PART, step + 1, total, training.state)
+    return training.gaussians
+
+
+class _Training:
+    """A map that is trained, whole or what a view may see of it."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        context: MapContext,
+        trained: NDArray[np.bool_] | None,
+        *,
+        in_parts: bool,
+    ) -> None:
+        self.gaussians, self._trained, self._camera = gaussians, trained, context.camera
+        weights = LossWeights(**context.config.finetune.loss.of(context.depth_kind).model_dump())
+        self._huber_m = weights.depth_huber_m
+        self._take = TrainingStep(Rasterizer(threads=context.threads), weights, context.depth_kind)
+        self._adam = CompiledAdam(len(gaussians), threads=context.threads)
+        floor_m = context.matching.thickness_floor_m
+        # thinner ones stay as they are
+        self._floor = np.minimum(gaussians.log_scales, np.float32(np.log(floor_m)))
+        self._cells = MapCells.of(gaussians) if in_parts else None
+        if in_parts:
+            self.gaussians = gaussians.select(np.arange(len(gaussians)))  # of its own: parts change in place
+
+    def state(self) -> tuple[Any, ...]:
+        """From which the training can go on."""
+        return self.gaussians, self._adam.state()
+
+    def go_on(self, state: tuple[Any, ...]) -> None:
+        """Go on from where another one was."""
+        self.gaussians, adam = state
+        self._adam.go_on(adam)
+
+    def step(self, view: PosedRgbd, looked_at: LookedAt, rates: LearningRates) -> None:
+        """Take a step on a view."""
+        take = partial(self._stepped, looked_at=looked_at, view=view, rates=rates)
+        if self._cells is None:
+            self.gaussians = take(self.gaussians, self._adam, self._floor, self._trained)
+            return
+        rows = self._cells.seen(view, self._camera)
+        part, adam = self.gaussians.select(rows), self._adam.part(rows)
+        stepped = take(part, adam, self._floor[rows], None if self._trained is None else self._trained[rows])
+        for name in TRAINED:
+            getattr(self.gaussians, name)[rows] = getattr(stepped, name)
+        self._adam.put(rows, adam)
+
+    def _stepped(
+        self,
+        gaussians: Gaussians,
+        adam: CompiledAdam,
+        floor: NDArray[np.float32],
+        trained: NDArray[np.bool_] | None,
+        *,
+        view: PosedRgbd,
+        looked_at: LookedAt,
+        rates: LearningRates,
+    ) -> Gaussians:
+        stepped, _ = self._take(
             gaussians,
-            context.camera,
-            looked_at.of(_training_view(view, weights.depth_huber_m)),
+            self._camera,
+            looked_at.of(_training_view(view, self._huber_m)),
             adam=adam,
-            rates=config.rates.times(share),
+            rates=rates,
             least_log_scales=floor,
             closing=looked_at.closing,
         )
-        gaussians = stepped if trained is None else _where(trained, stepped, gaussians)
-        checkpoints.at(PART, step + 1, total, partial(_state, gaussians, adam))
-    return gaussians
-
-
-def _state(gaussians: Gaussians, adam: CompiledAdam) -> tuple[Any, ...]:
-    """From which the training can go on."""
-    return gaussians, adam.state()
+        return stepped if trained is None else _where(trained, stepped, gaussians)
 
 
 def _training_view(view: PosedRgbd, huber_m: float) -> TrainingView:
@@ -134,7 +187,7 @@ def _in_turn(views: Sequence[PosedRgbd], seed: int, stream: str) -> Iterator[tup
 def _where(chosen: NDArray[np.bool_], a: Gaussians, b: Gaussians) -> Gaussians:
     """The Gaussians of `a` where chosen, else those of `b`."""
     values = {}
-    for name in _TRAINED:
+    for name in TRAINED:
         x, y = getattr(a, name), getattr(b, name)
         values[name] = np.where(chosen.reshape(-1, *[1] * (x.ndim - 1)), x, y)
     return b.replace(**values)

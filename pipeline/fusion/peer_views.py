@@ -7,11 +7,12 @@ saw from different sides, which neither robot's own images contain.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
@@ -33,7 +34,8 @@ def peer_views(
     *,
     depth_kinds: Mapping[str, DepthKind],
     colors: Mapping[str, ColorMap],
-) -> list[PosedRgbd]:
+    keyframes: int = 0,
+) -> Sequence[PosedRgbd]:
     """Color and depth of every peer's map at its keyframes and half way between them, as the own camera sees.
 
     What a peer's map does not cover is masked.
@@ -45,13 +47,25 @@ def peer_views(
             evenly spread.
         depth_kinds: as the maps were made, by name.
         colors: from every peer's colors to the own.
+        keyframes: of the robot: a longer log has more views.
     """
-    rasterizer = Rasterizer(threads=context.threads)
     shown = [name for name in sorted(evidence) if len(evidence[name])]
     poses = [(name, T) for name in shown for T in _with_middles(T_world_keyframe[name])]
-    count = min(context.config.finetune.peer_views, len(poses))
+    config = context.config.finetune
+    count = min(config.at_most(config.peer_views, keyframes), len(poses))
     chosen = [poses[k] for k in evenly_spaced(len(poses), count)]
-    views, drawn = [], ""
+    return ShelvedList(_views(evidence, chosen, context, depth_kinds=depth_kinds, colors=colors))
+
+
+def _views(
+    evidence: Mapping[str, Evidence],
+    chosen: Sequence[tuple[str, Array]],
+    context: MapContext,
+    *,
+    depth_kinds: Mapping[str, DepthKind],
+    colors: Mapping[str, ColorMap],
+) -> Iterator[PosedRgbd]:
+    rasterizer, drawn = Rasterizer(threads=context.threads), ""
     for name, T_world_camera in chosen:
         if name != drawn:
             own_colors = colors[name].of(evidence[name])
@@ -62,8 +76,7 @@ def peer_views(
         share = np.where(seen, render.alpha, np.float32(1))
         color = np.rint(np.clip(render.color / share[..., None], 0, 1) * 255).astype(np.uint8)
         depth_m = np.where(seen, render.depth / share, np.float32(0))
-        views.append(PosedRgbd(color, depth_m, T_world_camera, seen))
-    return views
+        yield PosedRgbd(color, depth_m, T_world_camera, seen)
 
 
 def _with_middles(T: Array) -> Array:

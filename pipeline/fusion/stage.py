@@ -107,7 +107,7 @@ def run_fusion(
     context = MapContext(own.camera, config, matching, own.depth, weights, threads, seed=seed)
     views: Sequence[PosedRgbd] = []
     if len(result.component) > 1:
-        num_support = config.finetune.support_views
+        num_support = config.finetune.at_most(config.finetune.support_views, own.keyframes)
         views = training_views(source, frames, T_world_camera, num_support=num_support, moving=moving)
     fusion = _fuse(own, result, views, context, save=checkpoints or Checkpoints())
     refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
@@ -199,11 +199,18 @@ def _finetuned(
     config = context.config.finetune
     if not config.steps_per_view:
         return None
-    shown: list[PosedRgbd] = []
+    shown: Sequence[PosedRgbd] = ()
     begun, poses = fused.gaussians, result.T_world_keyframe_of
     if config.peer_share:
         usable = {name: e.select(~valid.contradicted[name]) for name, e in valid.evidence.items()}
-        shown = peer_views(usable, poses, context, depth_kinds=result.depth_of, colors=fused.colors)
+        shown = peer_views(
+            usable,
+            poses,
+            context,
+            depth_kinds=result.depth_of,
+            colors=fused.colors,
+            keyframes=own.keyframes,
+        )
         if context.config.final_start == "drawn" and context.config.imports_all:
             seen = [*views[: own.keyframes], *shown]
             begun = most_drawn(fused, usable, valid.pairs, context, robot=own.robot, views=seen)
@@ -219,7 +226,15 @@ def _finetuned(
                 depth_kinds=result.depth_of,
             )
     trained = None if shown else fused.source == fused.robots.index(own.robot)
-    return finetune_map(begun, views, context, trained=trained, peer_views=shown, checkpoints=save)
+    return finetune_map(
+        begun,
+        views,
+        context,
+        trained=trained,
+        peer_views=shown,
+        keyframes=own.keyframes,
+        checkpoints=save,
+    )
 
 
 def training_views(

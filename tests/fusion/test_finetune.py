@@ -13,6 +13,7 @@ from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.evaluation.image_metrics import psnr
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.finetune import finetune_map, num_steps
+from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.fusion.peer_views import peer_views
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
@@ -101,6 +102,50 @@ def test_the_same_bits_on_any_number_of_threads(spoiled: tuple[Gaussians, list[P
     assert not np.array_equal(one.means, other.means)
 
 
+def test_a_long_log_takes_the_same_steps_of_what_views_see(
+    spoiled: tuple[Gaussians, list[PosedRgbd]],
+) -> None:
+    gaussians, views = spoiled
+    config, peers = context(FinetuneConfig()), views[1::2]
+    seen = MapCells.of(gaussians).seen(views[0], CAMERA)
+    assert 100 < len(seen) < 390  # not what is behind the camera, or far beside it
+    own = np.arange(400) % 3 > 0
+    for trained in (None, own):
+        whole, parts = (
+            finetune_map(gaussians, views[::2], config, trained=trained, peer_views=peers, keyframes=k)
+            for k in (40, 41)
+        )
+        for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
+            assert np.array_equal(getattr(whole, name), getattr(parts, name))
+    assert not np.array_equal(parts.means, gaussians.means)
+    assert np.array_equal(spoiled[0].means, gaussians.means)
+
+
+@pytest.mark.parametrize("distance_m", [0.7, 2.0])
+def test_what_a_view_draws_is_in_the_cells_that_it_sees(distance_m: float) -> None:
+    """Two walls, of which the nearer one has a hole."""
+    rng = np.random.default_rng(3)
+    n, scales = 3000, np.log([0.08, 0.08, 0.001])
+    nearer = rng.uniform(-1.6, 1.6, (n, 3))
+    nearer = nearer[np.hypot(nearer[:, 0], nearer[:, 1]) > 0.3]
+    means = np.concatenate([nearer, rng.uniform(-3, 3, (n, 3))])
+    means[:, 2] = np.where(np.arange(len(means)) < len(nearer), distance_m, distance_m + 2)
+    walls = wall(len(means)).replace(
+        means=means.astype(np.float32),
+        log_scales=np.tile(np.float32(scales), (len(means), 1)),
+        opacity_logits=np.full(len(means), 5, np.float32),
+    )
+    rasterizer, cells = Rasterizer(), MapCells.of(walls)
+    for T in POSES:
+        rasterizer.forward(walls, CAMERA, se3.inverse(T))
+        weights, depth_m = rasterizer.contributions()[0], rasterizer.layer_depth()
+        assert weights[len(nearer) :].sum() > 10
+        seen = cells.seen(PosedRgbd(np.zeros((48, 64, 3), np.uint8), depth_m, T), CAMERA)
+        missing = np.setdiff1d(np.arange(len(walls)), seen)
+        assert len(missing) > len(walls) / 4
+        assert weights[missing].sum() < 1e-3 * weights.sum()
+
+
 def test_no_steps_change_nothing(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
     gaussians, views = spoiled
     assert finetune_map(gaussians, views, context(FinetuneConfig(steps_per_view=0))) is gaussians
@@ -167,7 +212,7 @@ def test_a_neighbors_map_shows_what_it_would_from_where_the_neighbor_stood() -> 
         all_of_them[k].T_world_camera.tolist() for k in (1, 3)
     ]
     assert np.array_equal(some[0].color, all_of_them[1].color)
-    assert peer_views({}, {}, context(FinetuneConfig()), depth_kinds={}, colors={}) == []
+    assert not peer_views({}, {}, context(FinetuneConfig()), depth_kinds={}, colors={})
 
 
 def test_neighbors_views_teach_what_own_ones_do_not_see(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
@@ -188,6 +233,9 @@ def test_steps_are_shared_out() -> None:
     assert num_steps(config, 4, 7) == (20, 5)
     assert num_steps(config, 40, 7) == (100, 25)
     assert num_steps(config, 40, 0) == (100, 0)
+    assert num_steps(config, 40, 7, keyframes=40) == (100, 25)
+    assert num_steps(config, 40, 7, keyframes=60) == (150, 38)  # a longer log has more
+    assert num_steps(config, 40, 7, keyframes=400) == (200, 50)
 
 
 def test_made_up_colors_of_a_neighbor_do_little_to_own_views(
