@@ -11,7 +11,7 @@ from duagc.pipeline.config.training import LearningRates, MapLossConfig, SparseS
 class FinetuneConfig(Config):
     """Finetuning of the fused map on the robot's own images and on renders of its peers' maps."""
 
-    keyframes: int = Field(default=40, ge=1)
+    keyframes: int = Field(default=48, ge=1)
     """Own keyframes up to which steps and views are at most those below; of a longer log, in proportion more."""
     steps_per_view: int = Field(default=8, ge=0)
     """Steps for each own view; 0: the fused map stays as fusion left it."""

@@ -49,8 +49,10 @@ class MappingConfig(Config):
     keyframes least go first."""
     seen_gaussians: int = 600_000
     """Most Gaussians of all tiles that the keyframes of a tile see; half of its own cap is there in any case."""
+    whole_keyframes: int = Field(default=64, ge=1)
+    """A map of at most so many keyframes is one tile."""
     tile_keyframes: int = Field(default=40, ge=2)
-    """Most keyframes of a tile: a longer log has a map of several, each optimized with the images of its keyframes."""
+    """Most keyframes of a tile of a larger map; each tile is optimized with the images of its keyframes."""
     border_keyframes: int = Field(default=24, ge=0)
     """Most keyframes of other tiles that look into a tile whose images take part in its optimization."""
     first_share: float = 0.35

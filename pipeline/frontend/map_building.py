@@ -128,7 +128,9 @@ class MapBuilder:
             se3.transform(k.T_map_camera, sight.center_camera[None])[0]
             for k, sight in zip(keyframes, self._sights, strict=True)
         ]
-        self._tiles = make_tiles(np.array(centers), self.config.mapping.tile_keyframes)
+        config, every = self.config.mapping, list(range(len(keyframes)))
+        whole = len(every) <= config.whole_keyframes
+        self._tiles = [every] if whole else make_tiles(np.array(centers), config.tile_keyframes)
 
     def _grown(self) -> tuple[list[MapUpdate], Any]:
         """Add all keyframes to the map, tile by tile; the messages about it, and the state of the map."""

@@ -105,7 +105,9 @@ def test_killed_again_and_again_it_ends_with_the_same_bits(
 
 
 def test_killed_in_any_tile_of_the_map_it_ends_with_the_same_bits(log: Path, tmp_path: Path) -> None:
-    mapping = CONFIG.mapping.model_copy(update={"tile_keyframes": 2, "border_keyframes": 1})
+    mapping = CONFIG.mapping.model_copy(
+        update={"whole_keyframes": 2, "tile_keyframes": 2, "border_keyframes": 1}
+    )
     keyframes = CONFIG.keyframes.model_copy(update={"min_overlap": 0.98})  # many of them
     config = CONFIG.model_copy(update={"mapping": mapping, "keyframes": keyframes})
     digest, _ = undisturbed(log, config, tmp_path)

@@ -113,7 +113,7 @@ def test_a_long_log_takes_the_same_steps_of_what_views_see(
     for trained in (None, own):
         whole, parts = (
             finetune_map(gaussians, views[::2], config, trained=trained, peer_views=peers, keyframes=k)
-            for k in (40, 41)
+            for k in (48, 49)
         )
         for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
             assert np.array_equal(getattr(whole, name), getattr(parts, name))
@@ -233,8 +233,8 @@ def test_steps_are_shared_out() -> None:
     assert num_steps(config, 4, 7) == (20, 5)
     assert num_steps(config, 40, 7) == (100, 25)
     assert num_steps(config, 40, 0) == (100, 0)
-    assert num_steps(config, 40, 7, keyframes=40) == (100, 25)
-    assert num_steps(config, 40, 7, keyframes=60) == (150, 38)  # a longer log has more
+    assert num_steps(config, 40, 7, keyframes=48) == (100, 25)
+    assert num_steps(config, 40, 7, keyframes=72) == (150, 38)  # a longer log has more
     assert num_steps(config, 40, 7, keyframes=400) == (200, 50)
 
 
