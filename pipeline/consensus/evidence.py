@@ -6,13 +6,16 @@ which the Fisher sums of the information stage hold, are dropped: fusion works p
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.row_blocks import row_blocks
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -119,21 +122,7 @@ class Evidence:
                 any if None.
             T_map_keyframe: [k, 4, 4], by anchor.
         """
-        packed, rows = _sums_of(gaussians, information)
-        if information is not None and len(rows):
-            deviation_m = np.zeros(len(gaussians))
-            deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
-            sums = mean_block(packed)
-            known = (sums != 0).any(axis=(1, 2), keepdims=True)
-            across = known * _across_surface(gaussians, deviation_m)
-            position = add_covariance(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
-            shape = add_covariance(log_covariance_block(packed), SHAPE_FLOOR**2 * np.eye(6))
-            packed[:, MEAN_INFORMATION], packed[:, LOG_COVARIANCE_INFORMATION] = (
-                pack_symmetric(position),
-                pack_symmetric(shape),
-            )
-        in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
-        return in_map._moved(se3.inverse(T_map_keyframe))
+        return _in_blocks(owner, gaussians, T_map_keyframe, partial(_shared, information=information))
 
     @staticmethod
     def from_rendering(
@@ -150,11 +139,7 @@ class Evidence:
             information: as of `from_map`.
             T_map_keyframe: as of `from_map`.
         """
-        packed, _ = _sums_of(gaussians, information)
-        if information is not None:
-            packed *= information.overlap
-        in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
-        return in_map._moved(se3.inverse(T_map_keyframe))
+        return _in_blocks(owner, gaussians, T_map_keyframe, partial(_rendered, information=information))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -181,18 +166,17 @@ class Evidence:
         """theta and information with every anchor's frame moved by its T [k, 4, 4]."""
         if not len(self):
             return self
-        R, D = T_new_anchor[:, :3, :3], spd.sym_rotation(T_new_anchor[:, :3, :3])
-        R, D, t = R[self.anchors], D[self.anchors], T_new_anchor[self.anchors, :3, 3]
-        theta = self.theta.copy()
-        theta[:, MEAN] = (R @ theta[:, MEAN, None])[..., 0] + t
-        theta[:, LOG_COVARIANCE] = (D @ theta[:, LOG_COVARIANCE, None])[..., 0]
-        information = self.information.copy()
-        information[:, MEAN_INFORMATION] = pack_symmetric(
-            R @ self.position_information() @ R.swapaxes(-1, -2)
-        )
-        information[:, LOG_COVARIANCE_INFORMATION] = pack_symmetric(
-            D @ self.shape_information() @ D.swapaxes(-1, -2)
-        )
+        theta, information = self.theta.copy(), self.information.copy()
+        D_of_anchor = spd.sym_rotation(T_new_anchor[:, :3, :3])
+        for rows in row_blocks(len(self)):
+            T, D = T_new_anchor[self.anchors[rows]], D_of_anchor[self.anchors[rows]]
+            R, before, block = T[:, :3, :3], self.information[rows], theta[rows]
+            block[:, MEAN] = (R @ block[:, MEAN, None])[..., 0] + T[:, :3, 3]
+            block[:, LOG_COVARIANCE] = (D @ block[:, LOG_COVARIANCE, None])[..., 0]
+            information[rows, MEAN_INFORMATION] = pack_symmetric(R @ mean_block(before) @ R.swapaxes(-1, -2))
+            information[rows, LOG_COVARIANCE_INFORMATION] = pack_symmetric(
+                D @ log_covariance_block(before) @ D.swapaxes(-1, -2)
+            )
         return Evidence(self.owner, self.ids, self.anchors, theta, information)
 
     def position_information(self) -> Array:
@@ -210,6 +194,43 @@ class Evidence:
     def opacity_information(self) -> Array:
         """[n], over the logit."""
         return self.information[:, OPACITY_INFORMATION]
+
+
+def _in_blocks(
+    owner: str, gaussians: Gaussians, T_map_keyframe: ArrayLike, packed: Callable[[Gaussians], Array]
+) -> Evidence:
+    """Evidence of a map in the frames of its anchors, with the information [n, 31] that `packed` gives of Gaussians."""
+    theta = np.empty((len(gaussians), THETA_SIZE))
+    information = np.empty((len(gaussians), INFORMATION_SIZE))
+    for rows in row_blocks(len(gaussians)):
+        some = gaussians.select(rows)
+        theta[rows], information[rows] = theta_of(some), packed(some)
+    in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta, information)
+    return in_map._moved(se3.inverse(T_map_keyframe))
+
+
+def _shared(gaussians: Gaussians, information: MapInformation | None) -> Array:
+    """Information [n, 31] of `Evidence.from_map`, in the map frame."""
+    packed, rows = _sums_of(gaussians, information)
+    if information is not None and len(rows):
+        deviation_m = np.zeros(len(gaussians))
+        deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
+        sums = mean_block(packed)
+        known = (sums != 0).any(axis=(1, 2), keepdims=True)
+        across = known * _across_surface(gaussians, deviation_m)
+        position = add_covariance(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
+        shape = add_covariance(log_covariance_block(packed), SHAPE_FLOOR**2 * np.eye(6))
+        packed[:, MEAN_INFORMATION], packed[:, LOG_COVARIANCE_INFORMATION] = (
+            pack_symmetric(position),
+            pack_symmetric(shape),
+        )
+    return packed
+
+
+def _rendered(gaussians: Gaussians, information: MapInformation | None) -> Array:
+    """Information [n, 31] of `Evidence.from_rendering`, in the map frame."""
+    packed, _ = _sums_of(gaussians, information)
+    return packed if information is None else packed * information.overlap
 
 
 def _across_surface(gaussians: Gaussians, deviation_m: Array) -> Array:

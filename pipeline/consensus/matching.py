@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.row_blocks import in_blocks
 from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.consensus.colors import ColorMap, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
@@ -41,6 +43,10 @@ _FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
 
 def held_thickness(vec_log_covariance: Array, floor_m: float) -> Array:
     """Unit vectors v = vec(e e') [n, 3, 6] of the axes at the thickness floor; zero for the others."""
+    return in_blocks(partial(_held_thickness, floor_m=floor_m), vec_log_covariance)
+
+
+def _held_thickness(vec_log_covariance: Array, floor_m: float) -> Array:
     values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
     held = 0.5 * values <= np.log(floor_m) + _FLOOR_SLACK
     axes = vectors.swapaxes(-1, -2)  # [n, axis, 3]
@@ -62,11 +68,17 @@ class _Chart:
 
     @staticmethod
     def of(theta: Array, config: MapMatching) -> _Chart:
-        values, vectors = np.linalg.eigh(spd.vec_to_sym(theta[:, LOG_COVARIANCE]))
-        values = np.maximum(values, 2 * np.log(config.thickness_floor_m))
         clamped = theta.copy()
-        clamped[:, LOG_COVARIANCE] = spd.sym_to_vec((vectors * values[:, None, :]) @ vectors.swapaxes(-1, -2))
+        no_thinner = partial(_no_thinner, floor_m=config.thickness_floor_m)
+        clamped[:, LOG_COVARIANCE] = in_blocks(no_thinner, theta[:, LOG_COVARIANCE])
         return _Chart(clamped, held_thickness(theta[:, LOG_COVARIANCE], config.thickness_floor_m))
+
+
+def _no_thinner(vec_log_covariance: Array, floor_m: float) -> Array:
+    """The same [n, 6] with no standard deviation below the floor."""
+    values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
+    values = np.maximum(values, 2 * np.log(floor_m))
+    return spd.sym_to_vec((vectors * values[:, None, :]) @ vectors.swapaxes(-1, -2))
 
 
 def _distances(charts: tuple[_Chart, _Chart], i: Index, j: Index, config: MapMatching) -> Array:

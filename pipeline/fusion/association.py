@@ -15,12 +15,21 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.fusion import FusionConfig
-from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import held_thickness
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
-from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, THETA_SIZE
+from duagc.pipeline.splat.information import (
+    COLOR,
+    COLOR_INFORMATION,
+    LOG_COVARIANCE,
+    MEAN,
+    OPACITY,
+    OPACITY_INFORMATION,
+    THETA_SIZE,
+    log_covariance_block,
+    mean_block,
+)
 
 Index = NDArray[np.int64]
 # Information of the own mean (1/m^2) and shape, which decides where no robot has any. Matches are within centimeters,
@@ -47,13 +56,14 @@ class EvidenceRows:
     opacity: Array
 
     @staticmethod
-    def of(evidence: list[Evidence]) -> EvidenceRows:
+    def of(theta: Array, information: Array) -> EvidenceRows:
+        """The rows of theta [r, 13] and information [r, 31]."""
         return EvidenceRows(
-            np.concatenate([e.theta for e in evidence]),
-            np.concatenate([e.position_information() for e in evidence]),
-            np.concatenate([e.shape_information() for e in evidence]),
-            np.concatenate([e.color_information() for e in evidence]),
-            np.concatenate([e.opacity_information() for e in evidence]),
+            theta,
+            mean_block(information),
+            log_covariance_block(information),
+            information[:, COLOR_INFORMATION],
+            information[:, OPACITY_INFORMATION],
         )
 
     def with_rows(self, at: Index, other: EvidenceRows) -> EvidenceRows:
@@ -62,11 +72,6 @@ class EvidenceRows:
         for name, array in changed.items():
             array[at] = getattr(other, name)
         return EvidenceRows(**changed)
-
-    def take(self, rows: Index) -> EvidenceRows:
-        return EvidenceRows(
-            self.theta[rows], self.position[rows], self.shape[rows], self.color[rows], self.opacity[rows]
-        )
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,6 @@ from duagc.pipeline.splat.information import (
     OPACITY,
     THETA_SIZE,
     gaussians_of,
-    pack_information,
 )
 
 Index = NDArray[np.int64]
@@ -106,7 +105,8 @@ class _TeamEvidence:
         names: of all robots.
         evidence: by name, world frame, common colors.
         cameras: how the robots' colors relate.
-        rows: of all evidence.
+        theta: [rows, 13], of all evidence.
+        information: [rows, 31], likewise.
         start: int64 [r + 1], first row of every robot, and the number of rows.
     """
 
@@ -114,7 +114,8 @@ class _TeamEvidence:
     names: tuple[str, ...]
     evidence: dict[str, Evidence]
     cameras: TeamColors
-    rows: EvidenceRows
+    theta: Array
+    information: Array
     start: Index
 
     @staticmethod
@@ -123,9 +124,9 @@ class _TeamEvidence:
         cameras = team_colors(evidence, pairs, context.matching.colors)
         common = {n: cameras.to_common(n).of(evidence[n]) for n in names}
         start = np.concatenate([[0], np.cumsum([len(common[n]) for n in names])]).astype(np.int64)
-        return _TeamEvidence(
-            robot, names, common, cameras, EvidenceRows.of([common[n] for n in names]), start
-        )
+        theta = np.concatenate([common[n].theta for n in names])
+        information = np.concatenate([common[n].information for n in names])
+        return _TeamEvidence(robot, names, common, cameras, theta, information, start)
 
     @property
     def own_rows(self) -> Index:
@@ -194,7 +195,7 @@ def fuse(
     if context.config.coverage == "all" and len(added):
         surfaces = known_surfaces(moved, own.T_world_keyframe, depth_images, context)
         unseen = select_unseen(
-            team.rows.theta[added],
+            team.theta[added],
             matched.information[added],
             T_world_keyframe=own.T_world_keyframe,
             surfaces=surfaces,
@@ -210,7 +211,7 @@ def _fuse_tracks(
     team: _TeamEvidence, pairs: Pairs, self_information: Evidence, context: MapContext
 ) -> _Tracks:
     """Fuse all tracks; the receiver's row stands for a track, else that of the robot of the lowest name."""
-    rows, me = team.rows, team.names.index(team.robot)
+    me = team.names.index(team.robot)
     found = tracks(team.evidence, pairs, context.matching)
     member = team.start[found.robot] + found.row
     first = np.flatnonzero(np.diff(found.track, prepend=-1)).astype(np.int64)
@@ -219,20 +220,21 @@ def _fuse_tracks(
     reference[track_of_member[found.robot == me]] = np.flatnonzero(found.robot == me)
     representative = member[reference]
 
-    move = np.zeros((len(rows.theta), THETA_SIZE))
-    members = np.ones(len(rows.theta), dtype=np.int32)
-    sums = pack_information(rows.position, rows.shape, rows.color, rows.opacity)
+    move = np.zeros((len(team.theta), THETA_SIZE))
+    members = np.ones(len(team.theta), dtype=np.int32)
+    sums = team.information.copy()
     if len(first):
-        taking_part, mine = rows.take(member), np.flatnonzero(found.robot == me)
+        taking_part = EvidenceRows.of(team.theta[member], team.information[member])
+        mine = np.flatnonzero(found.robot == me)
         if context.config.association == "neighbors":
             common = team.cameras.to_common(team.robot)
             splats = common.of(self_information.select(found.row[mine]))
-            taking_part = taking_part.with_rows(mine, EvidenceRows.of([splats]))
+            taking_part = taking_part.with_rows(mine, EvidenceRows.of(splats.theta, splats.information))
         tracked = TrackMembers(taking_part, reference, first)
         move[representative] = fused_moves(tracked, context.config, context.matching.thickness_floor_m)
         members[representative] = np.diff(np.append(first, len(member)))
         sums[representative] = np.add.reduceat(sums[member], first, axis=0)
-    absorbed = np.zeros(len(rows.theta), dtype=bool)
+    absorbed = np.zeros(len(team.theta), dtype=bool)
     absorbed[member] = True
     absorbed[representative] = False
     return _Tracks(move, members, sums, absorbed)
@@ -240,22 +242,23 @@ def _fuse_tracks(
 
 def _fused_map(team: _TeamEvidence, matched: _Tracks, own_world: Gaussians, added: Index) -> FusedMap:
     """The receiver's Gaussians as moved, then the imported ones, in the receiver's colors."""
-    rows, own_rows, robot = team.rows, team.own_rows, team.robot
+    own_rows, robot = team.own_rows, team.robot
     common = team.cameras.to_common(robot)
-    move, sums = matched.move.copy(), matched.information.copy()
-    theta, move[:, COLOR] = rows.theta + move, move[:, COLOR] / common.gain
+    order = np.concatenate([own_rows, added])
+    move, sums = matched.move[order], matched.information[order]
+    theta, move[:, COLOR] = team.theta[order] + move, move[:, COLOR] / common.gain
     theta[:, COLOR] = common.from_other(theta[:, COLOR])
     sums[:, COLOR_INFORMATION] *= common.gain**2
-    kept = _applied(own_world, move[own_rows], rows.theta[own_rows, LOG_COVARIANCE])
+    own = slice(len(own_rows))
+    kept = _applied(own_world, move[own], team.theta[own_rows, LOG_COVARIANCE])
     ids = np.concatenate([team.evidence[n].ids for n in team.names])
     anchors = np.concatenate([team.evidence[n].anchors for n in team.names])
     next_id = int(own_world.ids.max()) + 1 if len(own_world) else 0
-    imported = gaussians_of(next_id + np.arange(len(added)), anchors[added], theta[added])
-    order = np.concatenate([own_rows, added])
+    imported = gaussians_of(next_id + np.arange(len(added)), anchors[added], theta[len(own_rows) :])
     return FusedMap(
         gaussians=Gaussians.concatenate([kept, imported]),
-        theta=theta[order],
-        information=sums[order],
+        theta=theta,
+        information=sums,
         robots=team.names,
         source=team.owner[order].astype(np.int32),
         source_ids=ids[order],

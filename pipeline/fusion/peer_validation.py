@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.row_blocks import in_blocks
 from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.config.fusion import PeerValidationConfig
 from duagc.pipeline.config.training import DepthKind
@@ -167,8 +168,12 @@ def validate_peer_maps(
 
 def _sizes_m(evidence: Evidence) -> Array:
     """Largest standard deviation [n] of each Gaussian."""
-    values = np.linalg.eigvalsh(spd.vec_to_sym(evidence.theta[:, LOG_COVARIANCE]))
-    return np.asarray(np.exp(0.5 * values.max(axis=1, initial=-np.inf)))
+
+    def sizes_m(vec_log_covariance: Array) -> Array:
+        values = np.linalg.eigvalsh(spd.vec_to_sym(vec_log_covariance))
+        return np.asarray(np.exp(0.5 * values.max(axis=1, initial=-np.inf)))
+
+    return in_blocks(sizes_m, evidence.theta[:, LOG_COVARIANCE])
 
 
 def _between(pairs: Pairs, own: str, other: str) -> Index:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.row_blocks import row_blocks
+from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project, visible
 from duagc.pipeline.information.views import MapViews
 
+Distances: TypeAlias = tuple[NDArray[np.int64], NDArray[np.float64]]
 MEDIAN_PX = 5
 NEAR_M = 0.05  # points closer to a camera than this are not judged by it
 
@@ -28,29 +34,49 @@ def surface_deviation(views: MapViews, gate_m: float) -> NDArray[np.float64]:
         views: the map and its images.
         gate_m: a surface farther than this from a Gaussian belongs to another one.
     """
+    near = ShelvedList(_near_surfaces(views, gate_m))
+    n = len(views.gaussians)
+    count, median = np.zeros(n, np.int64), np.zeros(n)
+    for block in row_blocks(n):
+        count[block], median[block] = _medians(near, block)
+    measured = count > 0
+    deviation_m = np.full(n, gate_m)
+    if measured.any():
+        views_of, median = count[measured], median[measured]
+        typical = np.median(median)
+        deviation_m[measured] = np.sqrt((views_of * median**2 + 0.5 * typical**2) / (views_of + 0.5))
+    return deviation_m
+
+
+def _near_surfaces(views: MapViews, gate_m: float) -> Iterator[Distances]:
+    """Of every view the rows of the Gaussians near a surface that it measured, ascending, and their distances."""
     import cv2
 
-    means, n = views.gaussians.means.astype(np.float64), len(views.gaussians)
-    all_rows, all_distances = [np.zeros(0, np.int64)], [np.zeros(0)]
+    means = views.gaussians.means.astype(np.float64)
     for image in views.images:
         usable = image.depth_m if image.mask is None else np.where(image.mask, image.depth_m, np.float32(0))
         smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(usable), MEDIAN_PX), dtype=np.float32)
         points = se3.transform(se3.inverse(image.T_world_camera), means)
         rows, distance_m = _from_tangent_planes(points, smooth, views.camera)
         near = np.abs(distance_m) < gate_m
-        all_rows.append(rows[near])
-        all_distances.append(np.abs(distance_m[near]))
+        yield rows[near], np.abs(distance_m[near])
+
+
+def _medians(near: Sequence[Distances], block: slice) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """How many views measured a surface near each Gaussian of some rows, and the median of its distances there."""
+    all_rows, all_distances = [np.zeros(0, np.int64)], [np.zeros(0)]
+    for rows, distance_m in near:
+        part = slice(*np.searchsorted(rows, (block.start, block.stop)))
+        all_rows.append(rows[part] - block.start)
+        all_distances.append(distance_m[part])
     rows, distance_m = np.concatenate(all_rows), np.concatenate(all_distances)
     distance_m = distance_m[np.lexsort((distance_m, rows))]
-    count = np.bincount(rows, minlength=n)
+    count = np.bincount(rows, minlength=block.stop - block.start)
+    median = np.zeros(len(count))
     measured = count > 0
-    deviation_m = np.full(n, gate_m)
-    if measured.any():
-        views_of, first = count[measured], (np.cumsum(count) - count)[measured]
-        median = distance_m[first + (views_of - 1) // 2]
-        typical = np.median(median)
-        deviation_m[measured] = np.sqrt((views_of * median**2 + 0.5 * typical**2) / (views_of + 0.5))
-    return deviation_m
+    first = (np.cumsum(count) - count)[measured]
+    median[measured] = distance_m[first + (count[measured] - 1) // 2]
+    return count, median
 
 
 def _from_tangent_planes(

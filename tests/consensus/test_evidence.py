@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from duagc.pipeline.base import row_blocks
+from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.consensus.evidence import SHAPE_FLOOR, Evidence
+from duagc.pipeline.consensus.matching import gaussian_distance
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import (
@@ -130,3 +133,24 @@ def test_blocks_pack_as_documented():
 def test_no_gaussians_no_evidence():
     evidence = Evidence.from_map("alpha", Gaussians.empty(), None, np.eye(4)[None])
     assert len(evidence.in_world(np.eye(4)[None])) == 0
+
+
+def test_large_maps_go_in_blocks_to_the_same_bits(monkeypatch: pytest.MonkeyPatch):
+    gaussians, sums, T_map_keyframe = random_map(1)
+
+    def told() -> list[Evidence]:
+        shared = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
+        rendered = Evidence.from_rendering("alpha", gaussians, sums, T_map_keyframe)
+        return [shared, rendered, rendered.in_world(T_map_keyframe)]
+
+    def apart(a: Evidence) -> np.ndarray:
+        return gaussian_distance(a, np.arange(19), a, np.arange(1, 20), config=MapMatching())
+
+    whole = told()
+    distances = apart(whole[2])
+    assert (distances > 0).all()
+    monkeypatch.setattr(row_blocks, "ROWS", 7)
+    for one, other in zip(whole, told(), strict=True):
+        assert np.array_equal(one.theta, other.theta)
+        assert np.array_equal(one.information, other.information)
+    assert np.array_equal(apart(whole[2]), distances)

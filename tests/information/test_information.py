@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline import messages
+from duagc.pipeline.base import row_blocks
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
@@ -173,6 +174,15 @@ def test_the_deviation_is_the_distance_from_the_measured_surface() -> None:
     np.testing.assert_allclose(past[:3], np.abs(off_m[:3]), atol=1e-3)
     blind = PosedRgbd(view.color, view.depth_m, view.T_world_camera, np.zeros(depth.shape, bool))
     np.testing.assert_array_equal(surface_deviation(MapViews(gaussians, CAMERA, [blind]), 0.1), 0.1)
+
+
+def test_the_deviation_is_found_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians = wall()
+    views = MapViews(gaussians, CAMERA, views_of(gaussians, depth_factor=1.0))
+    whole = surface_deviation(views, 0.1)
+    assert len(np.unique(whole)) > 200
+    monkeypatch.setattr(row_blocks, "ROWS", 100)
+    assert np.array_equal(surface_deviation(views, 0.1), whole)
 
 
 def test_windows() -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import struct
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.row_blocks import in_blocks
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.exchange.wire.compact_wire import COMPACT, decode, encode
 from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
@@ -58,12 +60,12 @@ def record_dtype(kind: Kind) -> np.dtype[Any]:
 
 def to_body(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
     """Records as a packet of this kind has them. Rounding happens here, once: a body is passed on unchanged."""
-    return encode(records) if kind is Kind.EVIDENCE else records
+    return in_blocks(encode, records) if kind is Kind.EVIDENCE else records
 
 
 def from_body(kind: Kind, body: NDArray[Any]) -> NDArray[Any]:
     """Records as every receiver reads them."""
-    return decode(body, RECORD) if kind is Kind.EVIDENCE else body
+    return in_blocks(partial(decode, record=RECORD), body) if kind is Kind.EVIDENCE else body
 
 
 def write_evidence(kind: Kind, owner: int, depth: DepthKind, body: NDArray[Any]) -> bytes:
