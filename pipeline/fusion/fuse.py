@@ -16,12 +16,13 @@ robot's map has those of its own camera.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.consensus.colors import ColorMap, TeamColors, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import Pairs, tracks
@@ -33,6 +34,7 @@ from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import (
     COLOR,
     COLOR_INFORMATION,
+    INFORMATION_SIZE,
     LOG_COVARIANCE,
     MEAN,
     OPACITY,
@@ -122,11 +124,22 @@ class _TeamEvidence:
     def of(robot: str, evidence: Mapping[str, Evidence], pairs: Pairs, context: MapContext) -> _TeamEvidence:
         names = tuple(sorted(evidence))
         cameras = team_colors(evidence, pairs, context.matching.colors)
-        common = {n: cameras.to_common(n).of(evidence[n]) for n in names}
-        start = np.concatenate([[0], np.cumsum([len(common[n]) for n in names])]).astype(np.int64)
-        theta = np.concatenate([common[n].theta for n in names])
-        information = np.concatenate([common[n].information for n in names])
-        return _TeamEvidence(robot, names, common, cameras, theta, information, start)
+        start = np.concatenate([[0], np.cumsum([len(evidence[n]) for n in names])]).astype(np.int64)
+        theta = np.empty((start[-1], THETA_SIZE))
+        information = np.empty((start[-1], INFORMATION_SIZE))
+        for k, name in enumerate(names):
+            part, common = slice(start[k], start[k + 1]), cameras.to_common(name).of(evidence[name])
+            theta[part], information[part] = common.theta, common.information
+        theta, information = SHELF.put((theta, information))
+        common_evidence = {
+            n: replace(
+                evidence[n],
+                theta=theta[start[k] : start[k + 1]],
+                information=information[start[k] : start[k + 1]],
+            )
+            for k, n in enumerate(names)
+        }
+        return _TeamEvidence(robot, names, common_evidence, cameras, theta, information, start)
 
     @property
     def own_rows(self) -> Index:
@@ -273,6 +286,8 @@ def _in_order_of(ids: Index, own: Evidence) -> Evidence:
     """Own evidence in the order of the map's ids."""
     if not np.array_equal(np.sort(own.ids), np.sort(ids)):
         raise ValueError(f"{own.owner}: the own evidence must be on the Gaussians of the own map")
+    if np.array_equal(own.ids, ids):
+        return own
     return own.select(np.argsort(own.ids, kind="stable")[_rank(ids)])
 
 

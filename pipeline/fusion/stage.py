@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.shelf import ShelvedList
+from duagc.pipeline.base.shelf import SHELF, ShelvedList
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
@@ -150,10 +150,10 @@ def _untrained(
 ) -> tuple[ValidatedPeers, FusedMap]:
     """Validate the peers' maps, fuse, update opacities."""
     poses, keyframe_views = result.T_world_keyframe_of, views[: own.keyframes]
-    mine = in_world(result.own_evidence, poses[own.robot], context.weights)
+    mine = SHELF.put(in_world(result.own_evidence, poses[own.robot], context.weights))
     valid = validate_peer_maps(
         mine,
-        {name: in_world(e, poses[name], context.weights) for name, e in result.evidence.items()},
+        {name: SHELF.put(in_world(e, poses[name], context.weights)) for name, e in result.evidence.items()},
         result.pairs,
         context,
         views=keyframe_views,
@@ -168,7 +168,7 @@ def _untrained(
         {own.robot: mine, **valid.evidence},
         valid.pairs,
         context,
-        self_information=in_world(own_information, poses[own.robot], context.weights),
+        self_information=SHELF.put(in_world(own_information, poses[own.robot], context.weights)),
         depth_images=_depth_images(own),
         contradicted=valid.contradicted,
     )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.geometry.exposure import ExposureTrack
@@ -140,7 +141,7 @@ class RobotRun:
         path = self.folder / file
         if not path.is_file():
             raise DuagError(f"{path}: not found; run the stages that write it first")
-        return [r.message() for r in read_log(path, topics=[topic.of(self.robot)])]
+        return [SHELF.put(r.message()) for r in read_log(path, topics=[topic.of(self.robot)])]
 
     def _last(self, file: str, topic: topics.Topic) -> Any:
         found = self._all(file, topic)

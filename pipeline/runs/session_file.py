@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, new_file
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
 
@@ -124,7 +125,8 @@ def _plain_closure(closure: LoopClosureRecord, arrays: _Arrays) -> dict[str, Any
 
 
 def _evidence(plain: dict[str, Any], array: _Reader) -> Evidence:
-    return Evidence(**{name: value if name == "owner" else array(value) for name, value in plain.items()})
+    found = {name: value if name == "owner" else array(value) for name, value in plain.items()}
+    return SHELF.put(Evidence(**found))
 
 
 def _closure(plain: dict[str, Any], array: _Reader) -> LoopClosureRecord:
