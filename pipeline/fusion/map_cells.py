@@ -49,7 +49,7 @@ class MapCells:
         first = np.flatnonzero(np.diff(cell[order], prepend=-1))
         means = gaussians.means[order]
         low, high = np.minimum.reduceat(means, first), np.maximum.reduceat(means, first)
-        centers = (low + high) / np.float32(2)
+        centers = ((low + high) / 2).astype(np.float32)
         reach = radii_m(gaussians.log_scales) + np.linalg.norm(gaussians.means - centers[cell], axis=1)
         radii = np.maximum.reduceat(reach[order], first) + np.float32(SPARE_M)
         return MapCells(cell, centers, radii.astype(np.float32))
