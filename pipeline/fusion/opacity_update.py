@@ -15,13 +15,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.fuse import FusedMap
+from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import FisherSums, Rasterizer
 from duagc.pipeline.kernels.training import LARGEST_LOGIT
+from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import OPACITY, OPACITY_INFORMATION
 
 LARGEST_RESIDUAL_SIGMA = 10.0  # residuals are clipped there: beyond it they are outliers, not noise
@@ -47,31 +51,17 @@ def update_opacities(
         color_sigma: standard deviation of these images' color channels, 0..1.
         pixels_per_sample: neighboring pixels that are worth one independent one (`information.noise`).
     """
-    camera, imported = context.camera, slice(num_own, None)
+    imported = slice(num_own, None)
     if num_own == len(fused.gaussians):
         return fused
     owners = fused.theta[imported, OPACITY]
     weight = fused.information[imported, OPACITY_INFORMATION]
     logits, gaussians = owners.copy(), fused.gaussians
-    rasterizer = Rasterizer(threads=context.threads)
     precision = np.float32(1 / (color_sigma**2 * pixels_per_sample))
-    limit = np.float32(LARGEST_RESIDUAL_SIGMA * color_sigma)
-    everywhere = np.full((camera.height, camera.width), precision, np.float32)
-    nowhere = np.zeros_like(everywhere)
+    pixels = _OwnPixels(views, context, precision, np.float32(LARGEST_RESIDUAL_SIGMA * color_sigma))
     for _ in range(context.config.own_pixel_steps):
-        slope, sums = np.zeros(len(gaussians)), FisherSums(len(gaussians))
-        for view in views:
-            T_camera_world = se3.inverse(view.T_world_camera)
-            render = rasterizer.forward(
-                gaussians, camera, T_camera_world, mask=view.mask, depth_kind=context.depth_kind
-            )
-            off = np.clip(render.color - view.unit_color, -limit, limit)
-            if view.mask is not None:
-                off[~view.mask] = 0.0
-            slope += rasterizer.backward(off * precision).opacity_logits
-            rasterizer.fisher(everywhere, nowhere, sums)
-        seen = sums.opacity[imported]
-        step = -(slope[imported] + weight * (logits - owners)) / np.where(seen > 0, seen + weight, 1.0)
+        slope, seen = (sums[imported] for sums in pixels.sums(gaussians))
+        step = -(slope + weight * (logits - owners)) / np.where(seen > 0, seen + weight, 1.0)
         moved = logits + np.clip(step, -LARGEST_STEP, LARGEST_STEP)
         logits = np.where(seen > 0, np.clip(moved, -LARGEST_LOGIT, LARGEST_LOGIT), logits)
         drawn = gaussians.opacity_logits.copy()
@@ -80,3 +70,57 @@ def update_opacities(
     theta = fused.theta.copy()
     theta[imported, OPACITY] = logits
     return replace(fused, gaussians=gaussians, theta=theta)
+
+
+class _OwnPixels:
+    """Own images, and what they say on the opacities of a map."""
+
+    def __init__(
+        self, views: Sequence[PosedRgbd], context: MapContext, precision: np.float32, limit: np.float32
+    ) -> None:
+        """Set up.
+
+        Args:
+            views: the images.
+            context: camera and settings.
+            precision: of a color channel of a pixel.
+            limit: largest residual of a color.
+        """
+        self._views, self._context, self._limit = views, context, limit
+        camera = context.camera
+        self._everywhere = np.full((camera.height, camera.width), precision, np.float32)
+        self._nowhere, self._precision = np.zeros_like(self._everywhere), precision
+        self._rasterizer = Rasterizer(threads=context.threads)
+        self._cells: MapCells | None = None
+
+    def sums(self, gaussians: Gaussians) -> tuple[Array, Array]:
+        """Slope and information of the opacity logits [n] of a map, whose other parameters never change."""
+        slope, information = np.zeros(len(gaussians)), np.zeros(len(gaussians))
+        if len(self._views) <= self._context.config.finetune.keyframes:
+            sums = FisherSums(len(gaussians))
+            for view in self._views:
+                slope += self._of_view(view, gaussians, sums)
+            return slope, sums.opacity
+        self._cells = self._cells or MapCells.of(gaussians)
+        for view in self._views:
+            rows = self._cells.seen(view, self._context.camera)
+            sums = FisherSums(len(rows))
+            slope[rows] += self._of_view(view, gaussians.select(rows), sums)
+            information[rows] += sums.opacity
+        return slope, information
+
+    def _of_view(self, view: PosedRgbd, gaussians: Gaussians, sums: FisherSums) -> NDArray[np.float32]:
+        """The slope by a view; its information is added to the sums."""
+        render = self._rasterizer.forward(
+            gaussians,
+            self._context.camera,
+            se3.inverse(view.T_world_camera),
+            mask=view.mask,
+            depth_kind=self._context.depth_kind,
+        )
+        off = np.clip(render.color - view.unit_color, -self._limit, self._limit)
+        if view.mask is not None:
+            off[~view.mask] = 0.0
+        slope = self._rasterizer.backward(off * self._precision).opacity_logits
+        self._rasterizer.fisher(self._everywhere, self._nowhere, sums)
+        return slope

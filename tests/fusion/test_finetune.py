@@ -121,9 +121,9 @@ def test_a_long_log_takes_the_same_steps_of_what_views_see(
     assert np.array_equal(spoiled[0].means, gaussians.means)
 
 
-@pytest.mark.parametrize("distance_m", [0.7, 2.0])
-def test_what_a_view_draws_is_in_the_cells_that_it_sees(distance_m: float) -> None:
+def test_what_a_view_draws_is_in_the_cells_that_it_sees() -> None:
     """Two walls, of which the nearer one has a hole."""
+    distance_m = 2.0
     rng = np.random.default_rng(3)
     n, scales = 3000, np.log([0.08, 0.08, 0.001])
     nearer = rng.uniform(-1.6, 1.6, (n, 3))
@@ -136,7 +136,7 @@ def test_what_a_view_draws_is_in_the_cells_that_it_sees(distance_m: float) -> No
         opacity_logits=np.full(len(means), 5, np.float32),
     )
     rasterizer, cells = Rasterizer(), MapCells.of(walls)
-    for T in POSES:
+    for T in POSES[::3]:
         rasterizer.forward(walls, CAMERA, se3.inverse(T))
         weights, depth_m = rasterizer.contributions()[0], rasterizer.layer_depth()
         assert weights[len(nearer) :].sum() > 10

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.consensus import MapMatching
-from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.config.fusion import FinetuneConfig, FusionConfig
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.fuse import FusedMap
 from duagc.pipeline.fusion.opacity_update import update_opacities
@@ -97,3 +97,10 @@ def test_without_steps_or_usable_pixels_every_bit_stays():
 def test_threads_do_not_show():
     one, three = updated(1.0), updated(1.0, threads=3)
     np.testing.assert_array_equal(one.gaussians.opacity_logits, three.gaussians.opacity_logits)
+
+
+def test_of_a_long_log_each_view_takes_what_it_sees():
+    long = CONFIG.model_copy(update={"finetune": FinetuneConfig(keyframes=2)})
+    one, other = updated(1.0), updated(1.0, long)
+    assert np.array_equal(one.gaussians.opacity_logits, other.gaussians.opacity_logits)
+    assert not np.array_equal(one.gaussians.opacity_logits, with_imported(1.0).gaussians.opacity_logits)
