@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.row_blocks import row_blocks
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.matching import held_thickness
 from duagc.pipeline.geometry import spd
@@ -88,6 +89,18 @@ class TrackMembers:
     rows: EvidenceRows
     reference: Index
     first: Index
+
+    def some(self, tracks: slice) -> TrackMembers:
+        """Those of some tracks that follow each other.
+
+        Args:
+            tracks: which.
+        """
+        ends = np.append(self.first, len(self.rows.theta))
+        begin = ends[tracks.start]
+        rows = slice(begin, ends[tracks.stop])
+        part = EvidenceRows(**{name: array[rows] for name, array in vars(self.rows).items()})
+        return TrackMembers(part, self.reference[tracks] - begin, self.first[tracks] - begin)
 
     @cached_property
     def sizes(self) -> Index:
@@ -243,9 +256,9 @@ class _AssociationCovariance:
     opacity: Array
 
     @staticmethod
-    def of(members: TrackMembers, config: FusionConfig) -> _AssociationCovariance:
+    def of(members: TrackMembers, scatter: Scatter, config: FusionConfig) -> _AssociationCovariance:
         """By `config.association`."""
-        scatter, theta = Scatter.of(members, config), members.rows.theta
+        theta = members.rows.theta
         share = np.full(len(theta), 0.5)  # of the variance of a difference: both members' alike
         assigned = association_covariance(theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
         if config.association == "neighbors":
@@ -268,8 +281,21 @@ def fused_moves(members: TrackMembers, config: FusionConfig, thickness_floor_m: 
         config: association and scatter.
         thickness_floor_m: least standard deviation that the mapper lets a Gaussian have.
     """
+    scatter = Scatter.of(members, config)
+    return np.concatenate(
+        [
+            _fused_moves(members.some(tracks), scatter, config, thickness_floor_m)
+            for tracks in row_blocks(len(members.first))
+        ]
+    )
+
+
+def _fused_moves(
+    members: TrackMembers, scatter: Scatter, config: FusionConfig, thickness_floor_m: float
+) -> Array:
+    """`fused_moves` of some tracks, with the scatter of all."""
     rows, delta, first = members.rows, members.delta, members.first
-    spread = _AssociationCovariance.of(members, config)
+    spread = _AssociationCovariance.of(members, scatter, config)
     held = held_thickness(rows.theta[members.reference, LOG_COVARIANCE], thickness_floor_m)
     free = np.eye(6) - held.swapaxes(-1, -2) @ held
     position = add_covariance(rows.position, spread.position)

@@ -158,16 +158,25 @@ class _Tracks:
     """What matched Gaussians become.
 
     Attributes:
-        move: [rows, 13], fused minus own theta of the row that stands for its track, zero elsewhere.
-        members: int32 [rows], robots whose evidence is in it.
-        information: [rows, 31], summed over the members in rows that stand for a track.
+        representative: int64 [g], row that stands for each track.
+        move: [g, 13], fused minus own theta of that row.
+        members: int32 [g], robots whose evidence is in it.
+        information: [g, 31], summed over the members.
         absorbed: bool [rows], rows that are represented by another one.
     """
 
+    representative: Index
     move: Array
     members: NDArray[np.int32]
     information: Array
     absorbed: NDArray[np.bool_]
+
+    def among(self, rows: Index) -> tuple[Index, Index]:
+        """Places in some rows of those that stand for a track, and these tracks."""
+        track = np.full(len(self.absorbed), -1)
+        track[self.representative] = np.arange(len(self.representative))
+        places = np.flatnonzero(track[rows] >= 0)
+        return places, track[rows[places]]
 
 
 def fuse(
@@ -209,7 +218,7 @@ def fuse(
         surfaces = known_surfaces(moved, own.T_world_keyframe, depth_images, context)
         unseen = select_unseen(
             team.theta[added],
-            matched.information[added],
+            _information(team, matched, added),
             T_world_keyframe=own.T_world_keyframe,
             surfaces=surfaces,
             context=context,
@@ -233,9 +242,7 @@ def _fuse_tracks(
     reference[track_of_member[found.robot == me]] = np.flatnonzero(found.robot == me)
     representative = member[reference]
 
-    move = np.zeros((len(team.theta), THETA_SIZE))
-    members = np.ones(len(team.theta), dtype=np.int32)
-    sums = team.information.copy()
+    move = np.zeros((len(first), THETA_SIZE))
     if len(first):
         taking_part = EvidenceRows.of(team.theta[member], team.information[member])
         mine = np.flatnonzero(found.robot == me)
@@ -244,13 +251,25 @@ def _fuse_tracks(
             splats = common.of(self_information.select(found.row[mine]))
             taking_part = taking_part.with_rows(mine, EvidenceRows.of(splats.theta, splats.information))
         tracked = TrackMembers(taking_part, reference, first)
-        move[representative] = fused_moves(tracked, context.config, context.matching.thickness_floor_m)
-        members[representative] = np.diff(np.append(first, len(member)))
-        sums[representative] = np.add.reduceat(sums[member], first, axis=0)
+        move = fused_moves(tracked, context.config, context.matching.thickness_floor_m)
     absorbed = np.zeros(len(team.theta), dtype=bool)
     absorbed[member] = True
     absorbed[representative] = False
-    return _Tracks(move, members, sums, absorbed)
+    return _Tracks(
+        representative,
+        move,
+        np.diff(np.append(first, len(member))).astype(np.int32),
+        np.add.reduceat(team.information[member], first, axis=0) if len(first) else team.information[:0],
+        absorbed,
+    )
+
+
+def _information(team: _TeamEvidence, matched: _Tracks, rows: Index) -> Array:
+    """Information [n, 31] of some rows, summed over the members of those that stand for a track."""
+    information = team.information[rows]
+    places, track = matched.among(rows)
+    information[places] = matched.information[track]
+    return information
 
 
 def _fused_map(team: _TeamEvidence, matched: _Tracks, own_world: Gaussians, added: Index) -> FusedMap:
@@ -258,9 +277,15 @@ def _fused_map(team: _TeamEvidence, matched: _Tracks, own_world: Gaussians, adde
     own_rows, robot = team.own_rows, team.robot
     common = team.cameras.to_common(robot)
     order = np.concatenate([own_rows, added])
-    move, sums = matched.move[order], matched.information[order]
-    theta, move[:, COLOR] = team.theta[order] + move, move[:, COLOR] / common.gain
+    places, track = matched.among(order)
+    members = np.ones(len(order), np.int32)
+    members[places] = matched.members[track]
+    move = np.zeros((len(order), THETA_SIZE))
+    move[places] = matched.move[track]
+    theta = team.theta[order] + move
+    move[:, COLOR] /= common.gain
     theta[:, COLOR] = common.from_other(theta[:, COLOR])
+    sums = _information(team, matched, order)
     sums[:, COLOR_INFORMATION] *= common.gain**2
     own = slice(len(own_rows))
     kept = _applied(own_world, move[own], team.theta[own_rows, LOG_COVARIANCE])
@@ -275,8 +300,8 @@ def _fused_map(team: _TeamEvidence, matched: _Tracks, own_world: Gaussians, adde
         robots=team.names,
         source=team.owner[order].astype(np.int32),
         source_ids=ids[order],
-        members=matched.members[order],
-        matched=int(np.sum(matched.members[own_rows] > 1)),
+        members=members,
+        matched=int(np.sum(members[own] > 1)),
         added=len(added),
         colors={n: team.cameras.between(n, robot) for n in team.names if n != robot},
     )

@@ -134,7 +134,8 @@ def validate_peer_maps(
     too_large = {}
     for name in sorted(peers):
         possible = _sizes_m(peers[name]) <= largest_m
-        peer, too_large[name] = peers[name].select(possible), int(np.sum(~possible))
+        peer = peers[name] if possible.all() else peers[name].select(possible)
+        too_large[name] = int(np.sum(~possible))
         near = _near(own, peer, _between(pairs, own.owner, name), radius_m)
         judged[name] = _PhotometricCheck(views, context, depth_kinds[name], config, arrived=arrived[name])
         against = judged[name].contradicted(_in_colors_of(own, peer, near, matching), own_colors.variance)

@@ -99,7 +99,7 @@ def run_fusion(
     Raises:
         DuagError: a file lacks what it should hold, or two files do not belong together.
     """
-    own = load(source)
+    own = SHELF.put(load(source))
     frames = _placed_frames(source)
     T_world_camera = np.array(
         [result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames]
