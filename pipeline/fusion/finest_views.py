@@ -26,6 +26,7 @@ from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces
 from duagc.pipeline.fusion.fuse import FusedMap
+from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.projection import visible
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -94,6 +95,8 @@ def _resolutions(
 ) -> dict[str, dict[str, Array]]:
     """By owner of the Gaussians and by robot that saw them: the finest resolution at each [n]."""
     means = {name: np.asarray(g.means, dtype=np.float64) for name, g in maps.items()}
+    long = len(T_world_keyframe[robot]) > context.config.finetune.keyframes
+    cells = {name: MapCells.of(g) for name, g in maps.items()} if long else {}
     empty = np.zeros((context.camera.height, context.camera.width), np.float32)
     # a peer draws where it is opaque, not next to it
     exact = context.config.model_copy(update={"explained_px": 0})
@@ -105,7 +108,7 @@ def _resolutions(
         else:
             theirs = replace(context, config=exact, depth_kind=depth_kinds[seen_by])
             drawn = known_surfaces(gaussians, poses, ((k, empty) for k in range(len(poses))), theirs)
-        for name, finest in finest_resolution(means, poses, drawn, context).items():
+        for name, finest in finest_resolution(means, poses, drawn, context, cells).items():
             found[name][seen_by] = finest
     return found
 
@@ -116,7 +119,11 @@ def _imported(fused: FusedMap, owner: str, ids: NDArray[np.int64]) -> NDArray[np
 
 
 def finest_resolution(
-    means: Mapping[str, Array], T_world_keyframe: Array, surfaces: DepthImages, context: MapContext
+    means: Mapping[str, Array],
+    T_world_keyframe: Array,
+    surfaces: DepthImages,
+    context: MapContext,
+    cells: Mapping[str, MapCells] | None = None,
 ) -> dict[str, Array]:
     """Finest resolution, pixels per meter, at which keyframes of one robot saw each place; 0 of what none saw.
 
@@ -125,18 +132,23 @@ def finest_resolution(
         T_world_keyframe: [k, 4, 4], of the keyframes.
         surfaces: depth of known surfaces by keyframe (`known_surfaces`).
         context: camera and tolerances.
+        cells: of Gaussians at these places, so that not all are looked at in every image; None: all are.
     """
     config, camera = context.config, context.camera
     finest = {name: np.zeros(len(points)) for name, points in means.items()}
     for keyframe, depth_m in surfaces:
         T_camera_world = se3.inverse(T_world_keyframe[keyframe])
         for name, points in means.items():
-            seen = se3.transform(T_camera_world, points)
+            near: NDArray[np.int64] | slice = slice(None)
+            if cells:
+                near = cells[name].in_image(T_world_keyframe[keyframe], camera)
+            seen = se3.transform(T_camera_world, points[near])
             index, column, row = visible(camera, seen)
             z, surface_m = seen[index, 2], depth_m[row, column].astype(np.float64)
             reach_m = surface_m + config.explained_m + config.explained_relative * z
             saw = (surface_m > 0) & (z <= reach_m)
             index, z = index[saw], z[saw]
+            index = index if isinstance(near, slice) else near[index]
             finest[name][index] = np.maximum(finest[name][index], camera.fx / z)
     return finest
 

@@ -7,6 +7,7 @@ from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.finest_views import finest_resolution, from_finest_views
 from duagc.pipeline.fusion.fuse import OwnMap
+from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.splat.gaussians import Gaussians
 from tests.fixtures.gaussian_worlds import CAMERA, MATCHING, MapContext, fused
 
@@ -132,3 +133,16 @@ def test_a_place_behind_what_a_keyframe_sees_is_not_seen():
         {"any": points}, np.concatenate([at(1.0), pose]), [(1, MEASURED_M), (0, MEASURED_M - 1)], context
     )["any"]
     assert twice[1] == pytest.approx(CAMERA.fx / 1.05)
+
+
+def test_only_what_may_be_in_an_image_is_looked_at_in_large_maps():
+    context = MapContext(CAMERA, FusionConfig(), MATCHING)
+    beside = wall().replace(means=wall().means + np.float32([6.0, 0, 0]))
+    both = Gaussians.concatenate([wall(), beside])
+    cells = {"any": MapCells.of(both)}
+    assert len(cells["any"].in_image(at(0.5)[0], CAMERA)) <= len(wall())
+    means = {"any": both.means.astype(np.float64)}
+    surfaces = [(0, MEASURED_M)]
+    found = finest_resolution(means, at(0.5), surfaces, context, cells)["any"]
+    assert (found > 0).any()
+    assert np.array_equal(found, finest_resolution(means, at(0.5), surfaces, context)["any"])
