@@ -138,7 +138,7 @@ def test_no_gaussians_no_evidence():
 def test_large_maps_go_in_blocks_to_the_same_bits(monkeypatch: pytest.MonkeyPatch):
     gaussians, sums, T_map_keyframe = random_map(1)
 
-    def told() -> list[Evidence]:
+    def given() -> list[Evidence]:
         shared = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
         rendered = Evidence.from_rendering("alpha", gaussians, sums, T_map_keyframe)
         return [shared, rendered, rendered.in_world(T_map_keyframe)]
@@ -146,11 +146,11 @@ def test_large_maps_go_in_blocks_to_the_same_bits(monkeypatch: pytest.MonkeyPatc
     def apart(a: Evidence) -> np.ndarray:
         return gaussian_distance(a, np.arange(19), a, np.arange(1, 20), config=MapMatching())
 
-    whole = told()
+    whole = given()
     distances = apart(whole[2])
     assert (distances > 0).all()
     monkeypatch.setattr(row_blocks, "ROWS", 7)
-    for one, other in zip(whole, told(), strict=True):
+    for one, other in zip(whole, given(), strict=True):
         assert np.array_equal(one.theta, other.theta)
         assert np.array_equal(one.information, other.information)
     assert np.array_equal(apart(whole[2]), distances)

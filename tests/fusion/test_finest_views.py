@@ -137,8 +137,8 @@ def test_a_place_behind_what_a_keyframe_sees_is_not_seen():
 
 def test_only_what_may_be_in_an_image_is_looked_at_in_large_maps():
     context = MapContext(CAMERA, FusionConfig(), MATCHING)
-    beside = wall().replace(means=wall().means + np.float32([6.0, 0, 0]))
-    both = Gaussians.concatenate([wall(), beside])
+    aside = wall().replace(means=wall().means + np.float32([6.0, 0, 0]))
+    both = Gaussians.concatenate([wall(), aside])
     cells = {"any": MapCells.of(both)}
     assert len(cells["any"].in_image(at(0.5)[0], CAMERA)) <= len(wall())
     means = {"any": both.means.astype(np.float64)}

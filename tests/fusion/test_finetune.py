@@ -108,7 +108,7 @@ def test_a_long_log_takes_the_same_steps_of_what_views_see(
     gaussians, views = spoiled
     config, peers = context(FinetuneConfig()), views[1::2]
     seen = MapCells.of(gaussians).seen(views[0], CAMERA)
-    assert 100 < len(seen) < 390  # not what is behind the camera, or far beside it
+    assert 100 < len(seen) < 390  # not what is behind the camera, or far to its side
     own = np.arange(400) % 3 > 0
     for trained in (None, own):
         whole, parts = (
