@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.frontend.growing_map import GrowingMap
@@ -119,7 +120,7 @@ class Mapper(MapContent):
             view: as of `add_keyframe`.
             more: as of `add_keyframe`.
         """
-        self._borders.append(View.of(*view, huber_m=self._loss_weights.depth_huber_m, **more))
+        self._borders.append(SHELF.put(View.of(*view, huber_m=self._loss_weights.depth_huber_m, **more)))
 
     def add_keyframe(
         self,
