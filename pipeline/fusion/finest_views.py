@@ -108,7 +108,7 @@ def _resolutions(
         else:
             theirs = replace(context, config=exact, depth_kind=depth_kinds[seen_by])
             drawn = known_surfaces(gaussians, poses, ((k, empty) for k in range(len(poses))), theirs)
-        for name, finest in finest_resolution(means, poses, drawn, context, cells).items():
+        for name, finest in finest_resolution(means, poses, drawn, context, cells=cells).items():
             found[name][seen_by] = finest
     return found
 
@@ -123,6 +123,7 @@ def finest_resolution(
     T_world_keyframe: Array,
     surfaces: DepthImages,
     context: MapContext,
+    *,
     cells: Mapping[str, MapCells] | None = None,
 ) -> dict[str, Array]:
     """Finest resolution, pixels per meter, at which keyframes of one robot saw each place; 0 of what none saw.

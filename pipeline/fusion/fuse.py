@@ -139,7 +139,9 @@ class _TeamEvidence:
             )
             for k, n in enumerate(names)
         }
-        return _TeamEvidence(robot, names, common_evidence, cameras, theta, information, start)
+        return _TeamEvidence(
+            robot, names, common_evidence, cameras, theta=theta, information=information, start=start
+        )
 
     @property
     def own_rows(self) -> Index:

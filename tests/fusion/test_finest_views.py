@@ -143,6 +143,6 @@ def test_only_what_may_be_in_an_image_is_looked_at_in_large_maps():
     assert len(cells["any"].in_image(at(0.5)[0], CAMERA)) <= len(wall())
     means = {"any": both.means.astype(np.float64)}
     surfaces = [(0, MEASURED_M)]
-    found = finest_resolution(means, at(0.5), surfaces, context, cells)["any"]
+    found = finest_resolution(means, at(0.5), surfaces, context, cells=cells)["any"]
     assert (found > 0).any()
     assert np.array_equal(found, finest_resolution(means, at(0.5), surfaces, context)["any"])
