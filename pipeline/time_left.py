@@ -94,8 +94,8 @@ class TimeLeft:
             (stages.EXCHANGE, durations.exchange_s(sizes)),
             *((stages.FUSION, seconds) for seconds in fused_s),
             (stages.EVALUATION, self._evaluation.predicted_s()),
-            (stages.REPORT, durations.READERS_S / 2),
-            (stages.VIEW, durations.READERS_S / 2),
+            (stages.REPORT, durations.REPORT_S),
+            (stages.VIEW, durations.VIEW_S),
         ]
         self._later = [(stage.name, seconds) for stage, seconds in expected if stage in self._wanted]
         if stages.EVALUATION in self._wanted:

@@ -26,15 +26,15 @@ START_S = 2.0
 """Of a process."""
 INFORMATION_S = 0.020
 """Of a frame, for every million pixels."""
-FUSION_S = 2.0
+FUSION_S = 1.0
 """Of a robot that has peers."""
-FUSED_VIEW_S = (0.12, 1.00)
+FUSED_VIEW_S = (0.085, 1.00)
 """Of a view that its fused map is trained on: in any case, and for every million pixels."""
-SCORED_S, COMPARED_S = (0.027, 0.157), (0.02, 0.82)
+SCORED_S, COMPARED_S = (0.006, 0.225), (0.02, 0.82)
 """The same of a render that is scored, and of a view that is compared with the others."""
-SURFACE_S = 2.5
+SURFACE_S = 2.0
 """Of an evaluation of a robot, for its logs and the true surface."""
-AGREED_S = 1.2
+AGREED_S = 1.7
 """Of a robot that has peers, for what all are measured by together."""
 VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
@@ -42,8 +42,8 @@ RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
 """Maps that are drawn at a held-out view, at a keyframe, and at a view of a peer."""
 EXCHANGE_S = (2.4, 10.0)
 """Of a robot that has peers: in any case, and for every million pixels."""
-READERS_S = 7.0
-"""Report and view."""
+REPORT_S, VIEW_S = 5.0, 2.0
+"""Of the whole run."""
 SERIAL = 0.15
 """Share of a stage of several threads that one thread does."""
 

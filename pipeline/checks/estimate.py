@@ -50,7 +50,7 @@ def estimate(
     def side_by_side_s(stage: str, seconds: Iterable[float]) -> float:
         return ratios.get(stage, 1.0) * durations.side_by_side_s((), list(seconds), WORKERS)
 
-    seconds = durations.READERS_S
+    seconds = durations.REPORT_S + durations.VIEW_S
     prepared = (durations.front_end_s(row) + durations.information_s(row) for row in rows)
     seconds += side_by_side_s("frontend", prepared)
     seconds += side_by_side_s("evaluation", (durations.evaluation_s(row, len(rows)) for row in rows))
