@@ -14,10 +14,10 @@ from duagc.pipeline.config.mapping import MappingConfig
 
 Size = Mapping[str, int]
 """`frames`, `pixels` of an image and `keyframes` of a robot; `moved`: 1 if depth is of other times than color."""
-TRACKING_S, POSES_S, MODEL_S = (0.004, 0.030), (0.006, 0.022), (0.001, 0.057)
+TRACKING_S, POSES_S, MODEL_S = (0.005, 0.039), (0.007, 0.025), (0.001, 0.057)
 """Of a frame: in any case, and for every million pixels."""
 MOVED_S = 0.14
-"""Of moving the depth of a frame, for every million pixels; a frame is read three times."""
+"""Of moving the depth of a frame, for every million pixels; every stage that reads a frame does it."""
 MAPPING_S = (0.0015, 0.086)
 """The same of a step of mapping, of which every keyframe takes some."""
 FINAL_S = (0.0032, 0.087)
@@ -30,7 +30,7 @@ FUSION_S = 1.0
 """Of a robot that has peers."""
 FUSED_VIEW_S = (0.085, 1.00)
 """Of a view that its fused map is trained on: in any case, and for every million pixels."""
-SCORED_S, COMPARED_S = (0.006, 0.225), (0.02, 0.82)
+SCORED_S, COMPARED_S = (0.006, 0.200), (0.02, 0.75)
 """The same of a render that is scored, and of a view that is compared with the others."""
 SURFACE_S = 2.0
 """Of an evaluation of a robot, for its logs and the true surface."""
@@ -55,12 +55,12 @@ def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
         size: of the robot's log.
         mapping: how long its map is optimized.
     """
-    megapixels, frames, keyframes = size["pixels"] * 1e-6, size["frames"], size["keyframes"]
+    frames, keyframes = size["frames"], size["keyframes"]
 
     def of(cost: tuple[float, float]) -> float:
         return _of_pixels(cost, size)
 
-    moved = MOVED_S * megapixels * frames if size.get("moved") else 0.0
+    moved = _moved_s(size) * frames
     steps = max(
         mapping.final_iterations * keyframes, mapping.final_iterations_view * _trained_views(size, mapping)
     )
@@ -99,7 +99,7 @@ def fusion_s(size: Size) -> float:
     Args:
         size: of its log.
     """
-    view_s = _of_pixels(FUSED_VIEW_S, size) + (MOVED_S * size["pixels"] * 1e-6 if size.get("moved") else 0.0)
+    view_s = _of_pixels(FUSED_VIEW_S, size) + _moved_s(size)
     return FUSION_S + view_s * _trained_views(size, MappingConfig())
 
 
@@ -112,13 +112,13 @@ def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
     """
     views, keyframes = min(VIEWS, size["frames"] / HELD_OUT), min(VIEWS, size["keyframes"])
     of_peers = min(VIEWS, (robots - 1) * size["frames"] / HELD_OUT)
-    scored_s, compared_s = _of_pixels(SCORED_S, size), _of_pixels(COMPARED_S, size)
+    scored_s, compared_s, read_s = _of_pixels(SCORED_S, size), _of_pixels(COMPARED_S, size), _moved_s(size)
     return {
-        "held_out": scored_s * RENDERS * views,
-        "training": scored_s * KEYFRAME_RENDERS * keyframes,
-        "peers": scored_s * PEER_RENDERS * of_peers,
+        "held_out": (read_s + scored_s * RENDERS) * views,
+        "training": (read_s + scored_s * KEYFRAME_RENDERS) * keyframes,
+        "peers": (read_s + scored_s * PEER_RENDERS) * of_peers,
         "surface": SURFACE_S,
-        "agreement": compared_s * views,
+        "agreement": (read_s + compared_s) * views,
     }
 
 
@@ -178,6 +178,11 @@ def threaded_s(seconds: float, processors: int) -> float:
 
 def _of_pixels(cost: tuple[float, float], size: Size) -> float:
     return cost[0] + cost[1] * size["pixels"] * 1e-6
+
+
+def _moved_s(size: Size) -> float:
+    """Time of moving the depth of a frame to the time of its color."""
+    return MOVED_S * size["pixels"] * 1e-6 if size.get("moved") else 0.0
 
 
 def _trained_views(size: Size, mapping: MappingConfig) -> int:
