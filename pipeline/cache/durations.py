@@ -30,7 +30,7 @@ FUSION_S = 1.0
 """Of a robot that has peers."""
 FUSED_VIEW_S = (0.085, 1.00)
 """Of a view that its fused map is trained on: in any case, and for every million pixels."""
-SCORED_S, COMPARED_S = (0.006, 0.200), (0.02, 0.75)
+SCORED_S, COMPARED_S = (0.006, 0.200), (0.02, 0.55)
 """The same of a render that is scored, and of a view that is compared with the others."""
 SURFACE_S = 2.0
 """Of an evaluation of a robot, for its logs and the true surface."""
