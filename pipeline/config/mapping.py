@@ -93,6 +93,9 @@ class MappingConfig(Config):
     rates: LearningRates = LearningRates()
     final_rate_decay: float = 0.03
     """The final optimization's learning rates fall to this share: slowly, fast, slowly."""
+    joint_share: float = Field(default=0.5, ge=0.0, lt=1.0)
+    """Last share of the final optimization of a map of tiles in which the views of all tiles take part in random order,
+    each with all Gaussians that it may see; before, tile by tile."""
     sparse: SparseStepsConfig = SparseStepsConfig()
     """Of the steps at a keyframe, and of the final optimization."""
     stable_steps: int = 0

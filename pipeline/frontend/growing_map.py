@@ -189,6 +189,16 @@ class GrowingMap:
         if count and not keep_guests:
             self._step_of(guests, gradients, slice(count), take)
 
+    def step_of(self, rows: Indices, gradients: Gradients, take: TakeStep) -> None:
+        """Take an optimization step of some Gaussians, in place.
+
+        Args:
+            rows: [m], which.
+            gradients: of a loss by them.
+            take: as of `step`.
+        """
+        self._step_of(rows, gradients, slice(None), take)
+
     @property
     def _own(self) -> slice:
         return slice(self.guests, None)

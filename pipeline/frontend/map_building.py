@@ -7,6 +7,7 @@ final optimization; the others are registered to the finished map where depth is
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -16,21 +17,24 @@ from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
-from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.growing_map import GrowingMap
+from duagc.pipeline.frontend.joint_training import JointTraining, JointView
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
-from duagc.pipeline.frontend.mapping_budget import MappingBudget
+from duagc.pipeline.frontend.mapping_budget import MappingBudget, alone_steps
+from duagc.pipeline.frontend.mapping_views import training_view
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.output import BuiltMap, Maps
+from duagc.pipeline.frontend.supporting_frames import supporting_frames
 from duagc.pipeline.frontend.tile_checkpoints import TileCheckpoints
 from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_tile
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.exposure import ExposureTrack
-from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.view_extent import ViewExtent
+from duagc.pipeline.kernels.training import TrainingView
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration.moving import FreeSpace
@@ -232,11 +236,14 @@ class MapBuilder:
         ]
         wanted, steps = (sum(counts) for counts in zip(*plans, strict=True))
         self._left_out(wanted - steps, wanted, "of the final optimization", "final_megapixels_s")
+        joint_share = self.config.mapping.joint_share if len(self._tiles) > 1 else 0.0
+        alone = [alone_steps(taken, joint_share) for _, taken in plans]
         first, found = 0, None
         all_stats: list[MappingStats] = []
         if (saved := self._checkpoints.resume(part)) is not None:
             _, ((first, whole, self._poses, all_stats), *found) = saved
-            self._whole.go_on(whole)
+            if first < len(self._tiles):
+                self._whole.go_on(whole)
         for number, tile in enumerate(self._tiles[first:], first):
             mapper, self._kept = self._kept, None
             if mapper is not None and found is None:
@@ -248,9 +255,9 @@ class MapBuilder:
             for frame in of_tile[number]:
                 self._support(mapper, frame)
             others = (number, self._whole.state(), self._poses, all_stats)
-            before = sum(taken for _, taken in plans[:number])
+            before = sum(alone[:number])
             save = TileCheckpoints(self._checkpoints, others, found=found, before=before, total=steps)
-            all_stats.append(mapper.finalize(save, part, log_s=shares_s[number]))
+            all_stats.append(mapper.finalize(save, part, log_s=shares_s[number], joint_share=joint_share))
             found = None
             for k, T_map_camera in zip(tile, mapper.keyframe_poses, strict=True):
                 self._poses[self._keyframes[k].frame_index] = T_map_camera
@@ -258,20 +265,56 @@ class MapBuilder:
                 self._poses[frame.frame_index] = T_map_camera
             self._whole.put_back(mapper.growing_map)
             del mapper, save, others
-        return self._summed(all_stats), self._poses, self._whole.state()
+        stats = MappingStats.of_tiles(all_stats, [len(tile) for tile in self._tiles])
+        if joint_share:
+            done = (len(self._tiles), None, self._poses, all_stats)
+            save = TileCheckpoints(self._checkpoints, done, found=found, before=sum(alone), total=steps)
+            stats = self._trained_jointly(supporting, steps - sum(alone), save, stats)
+        return replace(stats, total=len(self._whole)), self._poses, self._whole.state()
 
-    def _summed(self, stats: Sequence[MappingStats]) -> MappingStats:
-        """Counts and mean losses of all tiles."""
-        if len(stats) == 1:
-            return stats[0]
-        weights = [len(tile) for tile in self._tiles]
-        return MappingStats(
-            inserted=sum(tile.inserted for tile in stats),
-            pruned=sum(tile.pruned for tile in stats),
-            total=len(self._whole),
-            loss_before=float(np.average([tile.loss_before for tile in stats], weights=weights)),
-            loss_after=float(np.average([tile.loss_after for tile in stats], weights=weights)),
+    def _trained_jointly(
+        self, supporting: Sequence[TrackedFrame], steps: int, save: Checkpoints, stats: MappingStats
+    ) -> MappingStats:
+        """Optimize all tiles together; counts and losses with those of before."""
+        views = [
+            self._joint_view(k.frame_index, k.T_map_camera, k.information, fixed=not number)
+            for number, k in enumerate(self._keyframes)
+        ]
+        for f in supporting:
+            T_map_camera = self._keyframes[f.keyframe_index].T_map_camera @ f.T_keyframe_camera
+            views.append(self._joint_view(f.frame_index, T_map_camera, f.information))
+        training = JointTraining(
+            views,
+            self.log.camera,
+            self.config.mapping,
+            depth=self._depth,
+            seed=self._seed,
+            threads=self._threads,
         )
+        pruned = training.run(self._whole, steps, save, f"{self.name}.final")
+        self._poses |= training.poses
+        losses = [training.losses[keyframe.frame_index] for keyframe in self._keyframes]
+        return replace(stats, pruned=stats.pruned + pruned, loss_after=float(np.mean(losses)))
+
+    def _joint_view(
+        self, frame_index: int, T_map_tracked: Array, information: Array, *, fixed: bool = False
+    ) -> JointView:
+        """A view, whose images are read when they are looked at; what moves is known by its pose before refinement."""
+
+        def read() -> TrainingView:
+            frame = self.log.frame(frame_index)
+            mask = self._free.usable(frame.usable_depth, T_map_tracked, frame.mask)
+            return training_view(
+                frame.color,
+                frame.depth,
+                T_map_tracked,
+                mask=mask,
+                depth_sigma_m=frame.depth_sigma,
+                huber_m=self.config.mapping.loss.of(self._depth).depth_huber_m,
+                exposure=self.exposures.at(frame_index),
+            )
+
+        return JointView(frame_index, self._poses[frame_index], information, fixed, read)
 
     def _left_out(self, steps: int, wanted: int, which: str, setting: str) -> None:
         """Say what a budget leaves out."""
@@ -355,27 +398,3 @@ class MapBuilder:
             loss_before=stats.loss_before,
             loss_after=stats.loss_after,
         )
-
-
-def supporting_frames(
-    frames: Sequence[TrackedFrame], keyframes: Sequence[Keyframe], config: FrontendConfig, *, tiles: int = 1
-) -> list[TrackedFrame]:
-    """Frames for the final optimization of the map: tracked, no keyframes, not held out; evenly spread over the log.
-
-    Args:
-        frames: of the log.
-        keyframes: of the map.
-        config: of the front end.
-        tiles: of the map; each gets a share.
-    """
-    taken = {keyframe.frame_index for keyframe in keyframes}
-    candidates = [
-        frame
-        for frame in frames
-        if frame.status is not Status.LOST
-        and frame.reason is Reason.NONE  # its depth and its color belong together
-        and frame.frame_index not in taken
-        and not is_held_out(frame.frame_index)
-    ]
-    count = min(tiles * config.mapping.support_views, len(candidates))
-    return [candidates[k] for k in evenly_spaced(len(candidates), count)]

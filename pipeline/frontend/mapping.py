@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,7 +25,7 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.map_content import MapContent
-from duagc.pipeline.frontend.mapping_budget import MappingBudget
+from duagc.pipeline.frontend.mapping_budget import MappingBudget, alone_steps
 from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
 from duagc.pipeline.frontend.view_poses import PoseStep, PoseSteps
 from duagc.pipeline.frontend.view_selection import optimization_window
@@ -63,6 +64,24 @@ class MappingStats:
     total: int
     loss_before: float
     loss_after: float
+
+    @staticmethod
+    def of_tiles(stats: Sequence[MappingStats], keyframes: Sequence[int]) -> MappingStats:
+        """Counts and mean losses of all tiles; a Gaussian is counted in every tile that sees it.
+
+        Args:
+            stats: of each.
+            keyframes: of each, how many.
+        """
+        if len(stats) == 1:
+            return stats[0]
+        return MappingStats(
+            inserted=sum(tile.inserted for tile in stats),
+            pruned=sum(tile.pruned for tile in stats),
+            total=sum(tile.total for tile in stats),
+            loss_before=float(np.average([tile.loss_before for tile in stats], weights=keyframes)),
+            loss_after=float(np.average([tile.loss_after for tile in stats], weights=keyframes)),
+        )
 
 
 class Mapper(MapContent):
@@ -221,7 +240,12 @@ class Mapper(MapContent):
         self._support.append(view)
 
     def finalize(
-        self, checkpoints: Checkpoints = NO_CHECKPOINTS, part: str = "final", *, log_s: float = math.inf
+        self,
+        checkpoints: Checkpoints = NO_CHECKPOINTS,
+        part: str = "final",
+        *,
+        log_s: float = math.inf,
+        joint_share: float = 0.0,
     ) -> MappingStats:
         """Optimize geometry, color and, where depth is not exact, poses over all views at full size.
 
@@ -232,6 +256,7 @@ class Mapper(MapContent):
             checkpoints: of the stage.
             part: its name there.
             log_s: time that the log took to record, for the budget.
+            joint_share: last share of the schedule that is left out, since all tiles are optimized together then.
 
         Returns:
             Counts of the whole optimization, losses as means over all keyframes at full size.
@@ -242,6 +267,8 @@ class Mapper(MapContent):
         first, found = checkpoints.resume(part) or (0, None)
         before, inserted, pruned = (self._mean_loss(), *self._cover()) if found is None else found[0]
         _, steps = self.budget.final_steps(len(self._views), len(views), log_s)
+        alone = alone_steps(steps, joint_share)
+        last_prune = min(steps // 2, alone - 1)
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._map.adam.freeze_after(None)
         poses = PoseSteps([view.information for view in views])
@@ -250,7 +277,7 @@ class Mapper(MapContent):
         if found is not None:
             poses.go_on(found[1])
             self.go_on(found[2])
-        for step in range(first, steps):
+        for step in range(first, alone):
             position = step % len(views)
             if position == 0 or step == first:
                 start = step - position
@@ -260,7 +287,7 @@ class Mapper(MapContent):
                 half = views[number % 2 :: 2] if len(views) >= MANY_VIEWS else views
                 pruned += self._prune_useless(half, len(views))
                 inserted += self._densify(1.0 / (len(rounds) - number))
-            elif step == steps // 2:
+            elif step == last_prune:
                 pruned += self._prune_useless(views, len(views))
             share = smoothstep_decay(step, steps, config.final_rate_decay)
             chosen = int(order[position])

@@ -52,3 +52,13 @@ class MappingBudget:
         seen = 1 - 0.5 * sparse.until if sparse.checkerboard else 1.0
         pixels = seen * self.camera.width * self.camera.height
         return wanted, int(min(wanted, 1e6 * config.final_megapixels_s * log_s / pixels))
+
+
+def alone_steps(steps: int, joint_share: float) -> int:
+    """Steps of the final optimization of a tile that it takes alone.
+
+    Args:
+        steps: in all.
+        joint_share: last share that all tiles take together.
+    """
+    return round((1 - joint_share) * steps)

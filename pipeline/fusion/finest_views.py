@@ -26,11 +26,11 @@ from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces
 from duagc.pipeline.fusion.fuse import FusedMap
-from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.projection import visible
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import gaussians_of, mean_block
+from duagc.pipeline.splat.map_cells import MapCells
 
 
 def from_finest_views(

@@ -24,13 +24,13 @@ from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.fusion import FinetuneConfig
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.fusion.context import MapContext
-from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.losses import depth_certainty
+from duagc.pipeline.splat.map_cells import MapCells
 from duagc.pipeline.splat.optimizer import TRAINED, smoothstep_decay
 
 PEERS_UNTIL = 0.6
@@ -141,7 +141,7 @@ class _Training:
         if self._cells is None:
             self.gaussians = take(self.gaussians, self._adam, self._floor, self._trained)
             return
-        rows = self._cells.seen(view, self._camera)
+        rows = self._cells.seen(view.depth_m, view.T_world_camera, self._camera)
         part, adam = self.gaussians.select(rows), self._adam.part(rows)
         stepped = take(part, adam, self._floor[rows], None if self._trained is None else self._trained[rows])
         for name in TRAINED:

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.fuse import FusedMap
-from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import FisherSums, Rasterizer
 from duagc.pipeline.kernels.training import LARGEST_LOGIT
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import OPACITY, OPACITY_INFORMATION
+from duagc.pipeline.splat.map_cells import MapCells
 
 LARGEST_RESIDUAL_SIGMA = 10.0  # residuals are clipped there: beyond it they are outliers, not noise
 LARGEST_STEP = 2.0
@@ -103,7 +103,7 @@ class _OwnPixels:
             return slope, sums.opacity
         self._cells = self._cells or MapCells.of(gaussians)
         for view in self._views:
-            rows = self._cells.seen(view, self._context.camera)
+            rows = self._cells.seen(view.depth_m, view.T_world_camera, self._context.camera)
             sums = FisherSums(len(rows))
             slope[rows] += self._of_view(view, gaussians.select(rows), sums)
             information[rows] += sums.opacity

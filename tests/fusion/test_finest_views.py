@@ -7,8 +7,8 @@ from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.finest_views import finest_resolution, from_finest_views
 from duagc.pipeline.fusion.fuse import OwnMap
-from duagc.pipeline.fusion.map_cells import MapCells
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.map_cells import MapCells
 from tests.fixtures.gaussian_worlds import CAMERA, MATCHING, MapContext, fused
 
 COLUMNS, ROWS = np.meshgrid(np.linspace(-1.5, 1.5, 40), np.linspace(-1.2, 1.2, 32))

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.view_extent import BLOCKS, NEAR_M, ViewExtent, radii_m
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -55,31 +54,34 @@ class MapCells:
         radii = np.maximum.reduceat(reach[order], first) + np.float32(SPARE_M)
         return MapCells(cell, centers, radii.astype(np.float32))
 
-    def seen(self, view: PosedRgbd, camera: PinholeCamera) -> NDArray[np.int64]:
+    def seen(
+        self, depth_m: NDArray[np.float32], T_map_camera: Array, camera: PinholeCamera
+    ) -> NDArray[np.int64]:
         """Rows of the Gaussians that a view may see, ascending.
 
         Args:
-            view: a depth image with its pose.
+            depth_m: [H, W], 0 where it is unknown.
+            T_map_camera: [4, 4], pose of the camera in the frame of the map.
             camera: of the view.
         """
-        return self._seen(ViewExtent.of(view.depth_m, camera), view.T_world_camera)
+        return self._seen(ViewExtent.of(depth_m, camera), T_map_camera)
 
-    def in_image(self, T_world_camera: Array, camera: PinholeCamera) -> NDArray[np.int64]:
+    def in_image(self, T_map_camera: Array, camera: PinholeCamera) -> NDArray[np.int64]:
         """Rows of the Gaussians that may be in an image, whatever hides them, ascending.
 
         Args:
-            T_world_camera: [4, 4], pose of the camera.
+            T_map_camera: [4, 4], pose of the camera.
             camera: that would see them.
         """
         nothing = np.zeros((camera.height, camera.width), np.float32)
-        return self._seen(ViewExtent.of(nothing, camera), T_world_camera)
+        return self._seen(ViewExtent.of(nothing, camera), T_map_camera)
 
-    def _seen(self, sight: ViewExtent, T_world_camera: Array) -> NDArray[np.int64]:
+    def _seen(self, sight: ViewExtent, T_map_camera: Array) -> NDArray[np.int64]:
         from scipy import ndimage
 
         camera = sight.camera
-        T_camera_world = se3.inverse(T_world_camera)
-        depth_m = self.centers_m @ T_camera_world[2, :3] + T_camera_world[2, 3] - self.radii_m
+        T_camera_map = se3.inverse(T_map_camera)
+        depth_m = self.centers_m @ T_camera_map[2, :3] + T_camera_map[2, 3] - self.radii_m
         blocks = BLOCKS * camera.fx / camera.width * self.radii_m / np.maximum(depth_m, NEAR_M)
         seen = np.zeros(len(self.centers_m), bool)
         below = 0
@@ -87,6 +89,6 @@ class MapCells:
             rows = np.flatnonzero((blocks > below) & (blocks <= reach))
             farthest_m = ndimage.maximum_filter(sight.farthest_m, 2 * min(reach, BLOCKS) + 1)
             around = replace(sight, farthest_m=farthest_m)
-            seen[rows] = around.sees(self.centers_m[rows], self.radii_m[rows], T_world_camera)
+            seen[rows] = around.sees(self.centers_m[rows], self.radii_m[rows], T_map_camera)
             below = reach
         return np.flatnonzero(seen[self.cell])

@@ -1,0 +1,160 @@
+"""The last part of the optimization of a map of tiles: the views of all tiles, each with all that it may see.
+
+In a building a view shows more of other tiles than of its own, and a tile that is optimized alone knows few of the
+views that look into it. So the end of the schedule goes over the views of all tiles in random order. A step draws and
+moves what its view may see, whichever tile owns it; images are read when their turn comes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import Checkpoints
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import DepthKind, LearningRates
+from duagc.pipeline.frontend.growing_map import GrowingMap
+from duagc.pipeline.frontend.view_poses import PoseSteps
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
+from duagc.pipeline.kernels.sparse_steps import SparseSteps
+from duagc.pipeline.kernels.training import TrainingStep, TrainingView
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.map_cells import MapCells
+from duagc.pipeline.splat.optimizer import smoothstep_decay
+
+
+@dataclass(frozen=True)
+class JointView:
+    """A view of any tile.
+
+    Attributes:
+        frame_index: of its images.
+        T_map_camera: [4, 4], its pose at first.
+        information: [6, 6] of the pose, by tracking (right tangent: translation m, rotation rad).
+        fixed: whether the pose stays.
+        read: gives its images.
+    """
+
+    frame_index: int
+    T_map_camera: Array
+    information: Array
+    fixed: bool
+    read: Callable[[], TrainingView]
+
+
+class JointTraining:
+    """Optimizes a map, and the poses of its views, over all of them."""
+
+    def __init__(
+        self,
+        views: Sequence[JointView],
+        camera: PinholeCamera,
+        config: MappingConfig,
+        *,
+        depth: DepthKind,
+        seed: int,
+        threads: int = 1,
+    ) -> None:
+        """Set up.
+
+        Args:
+            views: of all tiles.
+            camera: of all of them.
+            config: of the mapping.
+            depth: of a Gaussian at a pixel.
+            seed: of the run; the order of the views is drawn from it.
+            threads: of the rasterizer; changes no bit.
+        """
+        self._views, self._camera, self._config, self._seed = views, camera, config, seed
+        weights = LossWeights(**config.loss.of(depth).model_dump())
+        self._step = TrainingStep(Rasterizer(threads=threads), weights, depth)
+        self._refined = config.pose_rate > 0 and depth != "ray_plane"
+        self._pose_steps = PoseSteps([view.information for view in views])
+        self._T_map_camera = np.array([view.T_map_camera for view in views])
+        self._losses = np.zeros(len(views))
+
+    @property
+    def poses(self) -> dict[int, Array]:
+        """T_map_camera [4, 4] of the views by frame index, as refined so far."""
+        return {view.frame_index: T for view, T in zip(self._views, self._T_map_camera, strict=True)}
+
+    @property
+    def losses(self) -> dict[int, float]:
+        """The loss of each view by frame index, before its last step."""
+        return {view.frame_index: float(x) for view, x in zip(self._views, self._losses, strict=True)}
+
+    def run(self, whole: GrowingMap, steps: int, checkpoints: Checkpoints, part: str) -> int:
+        """Take the steps.
+
+        Args:
+            whole: the map; changed in place.
+            steps: how many.
+            checkpoints: of the stage.
+            part: its name there.
+
+        Returns:
+            How many Gaussians were removed.
+        """
+        config, count = self._config, len(self._views)
+        first, found = checkpoints.resume(part) or (0, None)
+        if found is None:
+            cells = MapCells.of(whole.gaussians)
+        else:
+            cells, poses, self._T_map_camera, self._losses, state = found
+            self._pose_steps.go_on(poses)
+            whole.go_on(state)
+        whole.gaussians = whole.gaussians.select(
+            np.arange(len(whole))
+        )  # of its own: steps change it in place
+        in_all = round(steps / config.joint_share)  # as if tiles were no more than the beginning of it
+        begun = in_all - steps
+        sparse = SparseSteps(config.sparse, self._camera, in_all)
+        for step in range(first, steps):
+            position = step % count
+            if position == 0 or step == first:
+                start = step - position
+                order = random_streams.generator(self._seed, "mapping.joint", start=start).permutation(count)
+            chosen = int(order[position])
+            share = smoothstep_decay(begun + step, in_all, config.final_rate_decay)
+            view = self._views[chosen].read()
+            T_map_camera = self._T_map_camera[chosen]
+            rows = cells.seen(view.depth_m, T_map_camera, self._camera)
+            looked_at = sparse.at(begun + step, visit=step // count + chosen)
+            moves = self._refined and not self._views[chosen].fixed
+            loss, gradients = self._step.gradients(
+                whole.gaussians.select(rows),
+                self._camera,
+                looked_at.of(_at(view, T_map_camera)),
+                pose=moves,
+                closing=looked_at.closing,
+            )
+            whole.step_of(rows, gradients, partial(self._stepped, rates=config.rates.times(share)))
+            if moves:
+                assert gradients.pose is not None  # it was asked for
+                tangent = self._pose_steps.step(chosen, gradients.pose, config.pose_rate * share)
+                self._T_map_camera[chosen] = T_map_camera @ se3.exp(tangent)
+            self._losses[chosen] = loss.value
+            state_of = partial(self._state, cells, whole)
+            checkpoints.at(part, step + 1, steps, state_of, shown=lambda: whole.gaussians)
+        return whole.prune_degenerate()
+
+    def _state(self, cells: MapCells, whole: GrowingMap) -> tuple[Any, ...]:
+        return cells, self._pose_steps.state(), self._T_map_camera, self._losses, whole.state()
+
+    def _stepped(
+        self, gaussians: Gaussians, gradients: Gradients, adam: CompiledAdam, *, rates: LearningRates
+    ) -> Gaussians:
+        least = np.float32(np.log(self._config.seeding.thickness_m))
+        return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, least_log_scales=least)
+
+
+def _at(view: TrainingView, T_map_camera: Array) -> TrainingView:
+    return TrainingView(view.color, view.depth_m, T_map_camera, view.mask, view.depth_certainty)
