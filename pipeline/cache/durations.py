@@ -8,6 +8,7 @@ or in the results of earlier ones (`checks.measured`).
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from duagc.pipeline.config.mapping import MappingConfig
@@ -61,15 +62,12 @@ def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
         return _of_pixels(cost, size)
 
     moved = _moved_s(size) * frames
-    steps = max(
-        mapping.final_iterations * keyframes, mapping.final_iterations_view * _trained_views(size, mapping)
-    )
     return {
         "start": START_S,
         "tracking": of(TRACKING_S) * frames + (of(TRACKING_S) * frames + moved if moved else 0.0),
         "poses": of(POSES_S) * frames + moved,
         "mapping": of(MAPPING_S) * mapping.iterations * keyframes,
-        "final": of(FINAL_S) * min(steps, mapping.final_iterations_max),
+        "final": of(FINAL_S) * _final_steps(size, mapping),
         "model": of(MODEL_S) * frames + moved,
     }
 
@@ -183,6 +181,19 @@ def _of_pixels(cost: tuple[float, float], size: Size) -> float:
 def _moved_s(size: Size) -> float:
     """Time of moving the depth of a frame to the time of its color."""
     return MOVED_S * size["pixels"] * 1e-6 if size.get("moved") else 0.0
+
+
+def _final_steps(size: Size, mapping: MappingConfig) -> float:
+    """Steps of the final optimization of all tiles of a map."""
+    whole = size["keyframes"] <= mapping.whole_keyframes
+    tiles = 1 if whole else math.ceil(size["keyframes"] / mapping.tile_keyframes)
+    keyframes = size["keyframes"] / tiles
+    views = (
+        min(keyframes + mapping.support_views, size["frames"] / tiles)
+        + (not whole) * mapping.border_keyframes
+    )
+    steps = max(mapping.final_iterations * keyframes, mapping.final_iterations_view * views)
+    return tiles * min(steps, mapping.final_iterations_max)
 
 
 def _trained_views(size: Size, mapping: MappingConfig) -> int:
