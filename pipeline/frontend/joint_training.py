@@ -8,7 +8,7 @@ moves what its view may see, whichever tile owns it; images are read when their 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -24,7 +24,7 @@ from duagc.pipeline.frontend.view_poses import PoseSteps
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
-from duagc.pipeline.kernels.sparse_steps import SparseSteps
+from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.map_cells import MapCells
@@ -104,16 +104,7 @@ class JointTraining:
             How many Gaussians were removed.
         """
         config, count = self._config, len(self._views)
-        first, found = checkpoints.resume(part) or (0, None)
-        if found is None:
-            cells = MapCells.of(whole.gaussians)
-        else:
-            cells, poses, self._T_map_camera, self._losses, state = found
-            self._pose_steps.go_on(poses)
-            whole.go_on(state)
-        whole.gaussians = whole.gaussians.select(
-            np.arange(len(whole))
-        )  # of its own: steps change it in place
+        first, cells = self._begin(whole, checkpoints.resume(part))
         in_all = round(steps / config.joint_share)  # as if tiles were no more than the beginning of it
         begun = in_all - steps
         sparse = SparseSteps(config.sparse, self._camera, in_all)
@@ -123,28 +114,47 @@ class JointTraining:
                 start = step - position
                 order = random_streams.generator(self._seed, "mapping.joint", start=start).permutation(count)
             chosen = int(order[position])
-            share = smoothstep_decay(begun + step, in_all, config.final_rate_decay)
-            view = self._views[chosen].read()
-            T_map_camera = self._T_map_camera[chosen]
-            rows = cells.seen(view.depth_m, T_map_camera, self._camera)
             looked_at = sparse.at(begun + step, visit=step // count + chosen)
-            moves = self._refined and not self._views[chosen].fixed
-            loss, gradients = self._step.gradients(
-                whole.gaussians.select(rows),
-                self._camera,
-                looked_at.of(_at(view, T_map_camera)),
-                pose=moves,
-                closing=looked_at.closing,
-            )
-            whole.step_of(rows, gradients, partial(self._stepped, rates=config.rates.times(share)))
-            if moves:
-                assert gradients.pose is not None  # it was asked for
-                tangent = self._pose_steps.step(chosen, gradients.pose, config.pose_rate * share)
-                self._T_map_camera[chosen] = T_map_camera @ se3.exp(tangent)
-            self._losses[chosen] = loss.value
-            state_of = partial(self._state, cells, whole)
-            checkpoints.at(part, step + 1, steps, state_of, shown=lambda: whole.gaussians)
+            share = smoothstep_decay(begun + step, in_all, config.final_rate_decay)
+            self._take_step(whole, cells, chosen, share=share, looked_at=looked_at)
+            state = partial(self._state, cells, whole)
+            checkpoints.at(part, step + 1, steps, state, shown=lambda: whole.gaussians)
         return whole.prune_degenerate()
+
+    def _begin(self, whole: GrowingMap, found: tuple[int, Any] | None) -> tuple[int, MapCells]:
+        """The first step, and the cells of the map; goes on from what was found of a process before."""
+        first = 0
+        if found is None:
+            cells = MapCells.of(whole.gaussians)
+        else:
+            first, (cells, pose_steps, self._T_map_camera, self._losses, of_map) = found
+            self._pose_steps.go_on(pose_steps)
+            whole.go_on(of_map)
+        whole.gaussians = whole.gaussians.select(
+            np.arange(len(whole))
+        )  # of its own: steps change it in place
+        return first, cells
+
+    def _take_step(
+        self, whole: GrowingMap, cells: MapCells, chosen: int, *, share: float, looked_at: LookedAt
+    ) -> None:
+        """One step of what a view may see, and of its pose."""
+        view, T_map_camera = self._views[chosen].read(), self._T_map_camera[chosen]
+        rows = cells.seen(view.depth_m, T_map_camera, self._camera)
+        moves = self._refined and not self._views[chosen].fixed
+        loss, gradients = self._step.gradients(
+            whole.gaussians.select(rows),
+            self._camera,
+            looked_at.of(replace(view, T_map_camera=T_map_camera)),
+            pose=moves,
+            closing=looked_at.closing,
+        )
+        whole.step_of(rows, gradients, partial(self._stepped, rates=self._config.rates.times(share)))
+        if moves:
+            assert gradients.pose is not None  # it was asked for
+            tangent = self._pose_steps.step(chosen, gradients.pose, self._config.pose_rate * share)
+            self._T_map_camera[chosen] = T_map_camera @ se3.exp(tangent)
+        self._losses[chosen] = loss.value
 
     def _state(self, cells: MapCells, whole: GrowingMap) -> tuple[Any, ...]:
         return cells, self._pose_steps.state(), self._T_map_camera, self._losses, whole.state()
@@ -154,7 +164,3 @@ class JointTraining:
     ) -> Gaussians:
         least = np.float32(np.log(self._config.seeding.thickness_m))
         return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, least_log_scales=least)
-
-
-def _at(view: TrainingView, T_map_camera: Array) -> TrainingView:
-    return TrainingView(view.color, view.depth_m, T_map_camera, view.mask, view.depth_certainty)
