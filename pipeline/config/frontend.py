@@ -311,6 +311,26 @@ class ModelConfig(Config):
     """Pixels between samples of the drawn map, finest level first."""
 
 
+class DelayConfig(Config):
+    """Delay of depth that its stamps do not show, by motions that color and depth see for themselves."""
+
+    enabled: bool = True
+    """Move the stamps of depth by the delay that is found."""
+    pairs: int = Field(default=40, ge=1)
+    """Pairs of frames that are compared."""
+    min_pairs: int = Field(default=12, ge=8)
+    """Pairs that a delay needs."""
+    sigmas: float = Field(default=3.0, ge=0.0)
+    """Times its standard deviation from which it is certain."""
+    least_s: float = Field(default=0.005, ge=0.0)
+    """Shorter ones are left: in that time a carried camera moves its view by about a pixel, to which color and depth
+    are registered."""
+    cameras_m: float = Field(default=0.01, gt=0.0)
+    """Standard deviation of where the depth camera stands, beside what the log says."""
+    cameras_rad: float = Field(default=0.01, gt=0.0)
+    """The same of how it is turned."""
+
+
 class SubmapConfig(GeometricVerificationConfig):
     """New submaps where the camera is lost, and the loop closures that join them, found as those between robots."""
 
@@ -348,6 +368,7 @@ class FrontendConfig(Config):
 
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
+    delay: DelayConfig = DelayConfig()
     mapping_enabled: bool = True
     """Grow a map; without, the log holds odometry and keyframes and an empty map."""
     exposure: ExposureConfig = ExposureConfig()

@@ -24,6 +24,7 @@ from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.components import Component
+from duagc.pipeline.frontend.depth_delay import certain_delay_ns
 from duagc.pipeline.frontend.exposure import ExposureEstimation
 from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector, Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
@@ -50,6 +51,7 @@ from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.recording import MotionPrior, RgbdLog, open_rgbd
+from duagc.pipeline.recording.moved_depth import DELAY_KEY
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -165,8 +167,14 @@ class _Tracking:
 
     def run(self) -> TrackedLog:
         """Track; where color and depth are of different times, again with depth moved by the first result."""
-        log = self.log
-        tracked = self.checkpoints.done("tracked", lambda: self._leading(self._pass()))
+        log, save = self.log, self.checkpoints
+        first = save.done("tracked first", lambda: self._frames("tracking"))
+        if delay_ns := save.done("delay", lambda: self._delay_ns(first)):
+            save.say(
+                f"depth of {log.robot} was taken {1e-6 * delay_ns:.1f} ms before its stamps, and is moved"
+            )
+            log.delay_depth(delay_ns)
+        tracked = save.done("tracked", lambda: self._leading(self._again(first)))
         if tracked.submaps[0].keyframes:
             log.move_depth(*_trajectories(tracked))
         return tracked
@@ -176,11 +184,14 @@ class _Tracking:
             return tracked
         return track_leading_frames(self.log, tracked, self.config)
 
-    def _pass(self) -> TrackedLog:
-        log = self.log
-        tracked = self.checkpoints.done("tracked first", lambda: self._frames("tracking"))
-        if log.pairing.largest_offset_ns and tracked.submaps[0].keyframes:
-            log.move_depth(*_trajectories(tracked))
+    def _delay_ns(self, tracked: TrackedLog) -> int:
+        if not tracked.submaps[0].keyframes:
+            return 0
+        return certain_delay_ns(self.log, _trajectories(tracked), self.config.delay)
+
+    def _again(self, tracked: TrackedLog) -> TrackedLog:
+        if self.log.pairing.largest_offset_ns and tracked.submaps[0].keyframes:
+            self.log.move_depth(*_trajectories(tracked))
             return self._frames("tracking again")
         return tracked
 
@@ -292,6 +303,8 @@ class _ComponentStage:
             "depth_without_color": str(len(log.pairing.depth_alone)),
             "depth_noise_m": "unknown" if self.noise_m is None else f"{self.noise_m:.6f}",
         }
+        if log.depth_delay_ns:
+            notes[DELAY_KEY] = str(log.depth_delay_ns)
         odometry = [odometry_message(self.name, frame, refined.T_map_keyframe) for frame in built.frames]
         write_log(
             path,

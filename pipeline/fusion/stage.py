@@ -39,6 +39,7 @@ from duagc.pipeline.messages import (
     RejectedMatches,
 )
 from duagc.pipeline.recording import LogWriter, open_rgbd, read_exposures, read_log
+from duagc.pipeline.recording.moved_depth import depth_delay_ns
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -263,6 +264,7 @@ def training_views(
     exposures = read_exposures(source.frontend, source.robot)
     with open_rgbd(source.log) as log:
         stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+        log.delay_depth(depth_delay_ns(source.frontend))
         log.move_depth(Trajectory(stamps, np.array([frame.T_map_camera for frame in frames])))
         free = FreeSpace(log.camera, moving)
 

@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.depth_sources import DepthImage
-from duagc.pipeline.recording.read import read_log
+from duagc.pipeline.recording.read import log_metadata, read_log
 from duagc.schemas import topics
 
 Image = NDArray[np.float32]
+DELAY_KEY = "depth_delay_ns"
+"""In the metadata of a front end's log: how much earlier than its stamps say depth was taken; without it, not."""
 SAME_SURFACE = np.float32(0.03)  # relative step of depth up to which neighbors are one surface
 LEAST_MOVE_PX = 0.25  # of a point at the median depth: less is not worth to interpolate for
 ROUNDS = 3  # of looking up where in the depth image a pixel was; each brings it nearer by the share that depth changes
@@ -74,6 +77,19 @@ def _motion_in(part: Trajectory, at: int, duration_ns: int) -> Array | None:
     curve = np.linalg.lstsq(np.vander(seconds, degree + 1), motions, rcond=None)[0]
     then, now = np.vander(np.array([1e-9 * duration_ns, 0.0]), degree + 1) @ curve
     return np.asarray(se3.inverse(se3.exp(now)) @ se3.exp(then))
+
+
+def depth_delay_ns(frontend: Path) -> int:
+    """How much earlier than its stamps say depth was taken, as the front end found it, nanoseconds.
+
+    Args:
+        frontend: frontend.mcap of a robot, or of a component.
+    """
+    text = log_metadata(frontend).get(DELAY_KEY, "0")
+    try:
+        return int(text)
+    except ValueError:
+        raise DuagError(f"{frontend}: {DELAY_KEY} is {text!r}, expected nanoseconds") from None
 
 
 def tracked_frames(frontend: Path) -> Trajectory:

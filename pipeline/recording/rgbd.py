@@ -17,7 +17,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.depth_sources import DepthImage, check_size, constant, depth_source
 from duagc.pipeline.recording.motion import MotionPrior, motion_prior
-from duagc.pipeline.recording.moved_depth import DepthMotion, move_depth, tracked_frames
+from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, move_depth, tracked_frames
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.pipeline.recording.read import LogFile, Record
 from duagc.schemas import topics as topic_table
@@ -59,7 +59,8 @@ class RgbdLog:
     camera, or a LiDAR's (`depth_sources`). Masks belong to the color image of the same publish time; `valid` belongs
     to all of them.
 
-    `robot`, `camera`, `depth_scale` (meters per unit), `valid` (bool [H, W], pixels that show the scene; None = all).
+    `robot`, `camera`, `depth_scale` (meters per unit), `valid` (bool [H, W], pixels that show the scene; None = all),
+    `depth_delay_ns` (of `delay_depth`).
     Reads what is asked for and keeps no more than a few frames.
     """
 
@@ -98,6 +99,7 @@ class RgbdLog:
         self._color_at = self._log.entries_by_time(*topics)
         self._depth_at = self._log.entries_by_time(self._source.topic)
         self.pairing = pair(self._color_at, self._depth_at)
+        self.depth_delay_ns = 0
         self._depth_motion: DepthMotion | None = None
         if not len(self.pairing.offsets_ns):
             raise DuagError(
@@ -163,6 +165,26 @@ class RgbdLog:
         """Close the file."""
         self._log.close()
 
+    def delay_depth(self, delay_ns: int) -> None:
+        """Read depth as taken earlier than its stamps say; every image gets the depth that is then nearest.
+
+        Args:
+            delay_ns: how much earlier.
+        """
+        moved_ns = delay_ns - self.depth_delay_ns
+        self.depth_delay_ns = delay_ns
+        self._depth_at = {stamp - moved_ns: entry for stamp, entry in self._depth_at.items()}
+        self.pairing = pair(self._color_at, self._depth_at)
+
+    def frame_offset_ns(self, index: int) -> int:
+        """How much later the depth of a frame was taken; 0 if it has none.
+
+        Args:
+            index: position in the log.
+        """
+        color, depth = self.pairing.pairs[index]
+        return 0 if depth is None else depth - color
+
     def move_depth(self, *parts: Trajectory) -> None:
         """Move depth of another time than its color into the time of the color, in all frames read from now on.
 
@@ -173,11 +195,12 @@ class RgbdLog:
             self._depth_motion = DepthMotion(*parts)
 
     def move_depth_by(self, frontend: Path) -> None:
-        """`move_depth` by the poses that the front end found.
+        """`delay_depth` and `move_depth` by what the front end found.
 
         Args:
-            frontend: frontend.mcap of the robot; read only if some depth is of another time.
+            frontend: frontend.mcap of the robot; poses are read only if some depth is of another time.
         """
+        self.delay_depth(depth_delay_ns(frontend))
         if self.pairing.largest_offset_ns:
             self.move_depth(tracked_frames(frontend))
 
@@ -212,7 +235,7 @@ class RgbdLog:
             image if mask is None else masks.filled(image, mask),
             self._of_scene(found.depth_m),
             mask=mask,
-            depth_offset_ns=0 if depth_stamp is None else depth_stamp - stamp,
+            depth_offset_ns=self.frame_offset_ns(index),
             depth_sigma=None if found.sigma_m is None else self._of_scene(found.sigma_m),
             depth_moved=moved,
         )
