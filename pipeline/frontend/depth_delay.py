@@ -37,6 +37,7 @@ TYPICAL_DEPTH_M = 2.0  # at which a translation counts as a motion of the view
 MEASURED = (Outcome.OK, Outcome.ILL_CONDITIONED)  # directions that are not determined have no information
 BY_COLOR = RegistrationConfig(residuals="gray")
 BY_DEPTH = RegistrationConfig(residuals="depth")
+FIRST_SIGMA_S = 1.0  # of a delay of which nothing is known
 CHI2_6_MEDIAN = 5.348  # median of chi^2 with 6 degrees of freedom
 ROUNDS = 20  # of reweighting
 PARTS = 5  # of the log, each of which is left out once
@@ -202,7 +203,7 @@ def _half_size(log: RgbdLog, index: int) -> RgbdPyramid:
 
 def _solve(found: Sequence[Difference], config: DelayConfig) -> tuple[float, float]:
     """Delay and its standard deviation by what is left, seconds; differences far off count little (Cauchy)."""
-    prior = np.diag([0.0, *[config.cameras_m**-2] * 3, *[config.cameras_rad**-2] * 3])
+    prior = np.diag([FIRST_SIGMA_S**-2, *[config.cameras_m**-2] * 3, *[config.cameras_rad**-2] * 3])
     J = np.array([np.concatenate([d.by_delay[:, None], d.by_cameras], axis=1) for d in found])
     off, W = np.array([d.off for d in found]), np.array([d.information for d in found])
     H, x = prior, np.zeros(7)

@@ -1,5 +1,6 @@
 """Depth that was taken earlier than its stamps say: the delay is found where it is certain, and depth is moved."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -108,6 +109,13 @@ def test_the_front_end_moves_depth_by_it(logs: dict[int, Path], tmp_path: Path) 
         assert seen.mean() > 0.9
         log.move_depth_by(tmp_path / "False.mcap")
         assert log.frame(9).depth_offset_ns == 0
+
+
+def test_pairs_that_tell_nothing_leave_it_open() -> None:
+    nothing = [replace(d, information=np.zeros((6, 6))) for d in differences(0.02, np.zeros(6))]
+    found = estimated_delay(nothing, CONFIG)
+    assert found is not None
+    assert found.sigma_s == pytest.approx(1.0)
 
 
 def differences(delay_s: float, turned: np.ndarray, wrong: int = 0) -> list[Difference]:
