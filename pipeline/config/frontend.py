@@ -318,8 +318,8 @@ class DelayConfig(Config):
     """Move the stamps of depth by the delay that is found."""
     pairs: int = Field(default=40, ge=1)
     """Pairs of frames that are compared."""
-    min_pairs: int = Field(default=12, ge=8)
-    """Pairs that a delay needs."""
+    min_pairs: int = Field(default=30, ge=8)
+    """Pairs that a delay needs: a log of a second does not tell it."""
     sigmas: float = Field(default=3.0, ge=0.0)
     """Times its standard deviation from which it is certain."""
     least_s: float = Field(default=0.005, ge=0.0)

@@ -57,7 +57,7 @@ class Delay:
 
 
 @dataclass(frozen=True)
-class Difference:
+class MotionDifference:
     """What the motion of a pair of frames by depth differs from that by color.
 
     Attributes:
@@ -93,18 +93,29 @@ class _View:
 def certain_delay_ns(log: RgbdLog, parts: Sequence[Trajectory], config: DelayConfig) -> int:
     """The delay of a log's depth if it is certain, and long enough to matter; else 0.
 
+    A log that has sigma of every depth computed it from images or sweeps: its errors look alike in views that are near
+    each other, which passes for a delay, and a stereo pair has none.
+
     Args:
         log: its depth as it was taken.
         parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
         config: of the estimate.
     """
-    found = estimated_delay(differences(log, parts, config), config) if config.enabled else None
+    if not config.enabled or _has_sigma(log):
+        return 0
+    found = estimated_delay(differences(log, parts, config), config)
     if found is None or abs(found.delay_s) < max(config.least_s, config.sigmas * found.sigma_s):
         return 0
     return round(1e9 * found.delay_s)
 
 
-def estimated_delay(found: Sequence[Difference], config: DelayConfig) -> Delay | None:
+def _has_sigma(log: RgbdLog) -> bool:
+    """Whether the log has sigma of its depth, pixel by pixel."""
+    first = next(k for k, (_, depth) in enumerate(log.pairing.pairs) if depth is not None)
+    return log.frame(first).depth_sigma is not None
+
+
+def estimated_delay(found: Sequence[MotionDifference], config: DelayConfig) -> Delay | None:
     """The delay that differences tell; None if they are too few.
 
     Args:
@@ -120,7 +131,7 @@ def estimated_delay(found: Sequence[Difference], config: DelayConfig) -> Delay |
     return Delay(delay_s, max(sigma_s, jackknife_s))
 
 
-def differences(log: RgbdLog, parts: Sequence[Trajectory], config: DelayConfig) -> list[Difference]:
+def differences(log: RgbdLog, parts: Sequence[Trajectory], config: DelayConfig) -> list[MotionDifference]:
     """Differences between motions by depth and by color, of pairs of frames spread over a log.
 
     Args:
@@ -172,7 +183,7 @@ def _change(T_first_second: Array, first: _View, second: _View) -> Array:
     return np.asarray(se3.adjoint(se3.inverse(T_first_second)) @ first.velocity - second.velocity)
 
 
-def _difference(log: RgbdLog, first: _View, second: _View) -> Difference | None:
+def _difference(log: RgbdLog, first: _View, second: _View) -> MotionDifference | None:
     """The difference of a pair; None if either motion cannot be found."""
     seen, other = (_half_size(log, view.index) for view in (first, second))
     reference, T_start = (
@@ -189,7 +200,7 @@ def _difference(log: RgbdLog, first: _View, second: _View) -> Difference | None:
     stated = second.velocity * late_s[1] - Ad @ first.velocity * late_s[0]
     both = np.linalg.pinv(by_color.information + by_depth.information, rcond=1e-9, hermitian=True)
     information = by_color.information @ both @ by_depth.information
-    return Difference(
+    return MotionDifference(
         se3.log(se3.inverse(T) @ by_depth.T_reference_target) - stated,
         _change(T, first, second),
         np.eye(6) - Ad,
@@ -201,7 +212,7 @@ def _half_size(log: RgbdLog, index: int) -> RgbdPyramid:
     return RgbdPyramid(pyramid_of(log.frame(index), log.camera, LEVELS).levels[1:])
 
 
-def _solve(found: Sequence[Difference], config: DelayConfig) -> tuple[float, float]:
+def _solve(found: Sequence[MotionDifference], config: DelayConfig) -> tuple[float, float]:
     """Delay and its standard deviation by what is left, seconds; differences far off count little (Cauchy)."""
     prior = np.diag([FIRST_SIGMA_S**-2, *[config.cameras_m**-2] * 3, *[config.cameras_rad**-2] * 3])
     J = np.array([np.concatenate([d.by_delay[:, None], d.by_cameras], axis=1) for d in found])

@@ -9,7 +9,7 @@ import pytest
 
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import DelayConfig, FrontendConfig, TrackingConfig
-from duagc.pipeline.frontend.depth_delay import Difference, certain_delay_ns, estimated_delay
+from duagc.pipeline.frontend.depth_delay import MotionDifference, certain_delay_ns, estimated_delay
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import Trajectory
@@ -118,7 +118,7 @@ def test_pairs_that_tell_nothing_leave_it_open() -> None:
     assert found.sigma_s == pytest.approx(1.0)
 
 
-def differences(delay_s: float, turned: np.ndarray, wrong: int = 0) -> list[Difference]:
+def differences(delay_s: float, turned: np.ndarray, wrong: int = 0) -> list[MotionDifference]:
     """Of pairs of a camera that is carried, with a noise of 1 mm and 1 mrad; the first ones wrong."""
     rng = np.random.default_rng(1)
     found = []
@@ -127,7 +127,7 @@ def differences(delay_s: float, turned: np.ndarray, wrong: int = 0) -> list[Diff
         by_cameras = np.eye(6) - se3.adjoint(se3.exp(rng.normal(scale=0.1, size=6)))
         off = delay_s * change + by_cameras @ turned + rng.normal(scale=1e-3, size=6)
         off += rng.normal(scale=0.05, size=6) if k < wrong else 0
-        found.append(Difference(off, change, by_cameras, 1e6 * np.eye(6)))
+        found.append(MotionDifference(off, change, by_cameras, 1e6 * np.eye(6)))
     return found
 
 
