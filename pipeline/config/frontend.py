@@ -326,7 +326,7 @@ class DelayConfig(Config):
     """Shorter ones are left: in that time a carried camera moves its view by about a pixel, to which color and depth
     are registered."""
     cameras_m: float = Field(default=0.01, gt=0.0)
-    """Standard deviation of where the depth camera stands, beside what the log says."""
+    """Standard deviation of where the depth camera stands relative to what the log says."""
     cameras_rad: float = Field(default=0.01, gt=0.0)
     """The same of how it is turned."""
 
