@@ -322,9 +322,8 @@ class DelayConfig(Config):
     """Pairs that a delay needs: a log of a second does not tell it."""
     sigmas: float = Field(default=3.0, ge=0.0)
     """Times its standard deviation from which it is certain."""
-    least_s: float = Field(default=0.005, ge=0.0)
-    """Shorter ones are left: in that time a carried camera moves its view by about a pixel, to which color and depth
-    are registered."""
+    least_s: float = Field(default=0.01, ge=0.0)
+    """Shorter ones are left: depth in coarse steps errs alike in near views, which may pass for some milliseconds."""
     cameras_m: float = Field(default=0.01, gt=0.0)
     """Standard deviation of where the depth camera stands relative to what the log says."""
     cameras_rad: float = Field(default=0.01, gt=0.0)
