@@ -84,11 +84,13 @@ class ExchangeConfig(Config):
     """Length of one round."""
     max_rounds: int = Field(default=3000, ge=1)
     """The session ends here, whatever has been agreed."""
-    solver: Literal["admm", "elimination", "elected", "algorithm_1", "algorithm_1_printed"] = "admm"
+    solver: Literal[
+        "admm", "elimination", "elected", "block_descent", "algorithm_1", "algorithm_1_printed"
+    ] = "admm"
     """Of the poses. admm: relaxed edge-ADMM, a few poses per round and link; elimination: exact steps along a tree of
-    robots, matrices in few rounds; to compare with, one elected robot that gets all graphs and solves for all, and
-    Algorithm 1 of the paper, by which matched Gaussians move poses: with the corrections that it needs, or as
-    printed."""
+    robots, matrices in few rounds; to compare with, one elected robot that gets all graphs and solves for all,
+    block-coordinate descent, one robot after the other, and Algorithm 1 of the paper, by which matched Gaussians move
+    poses: with the corrections that it needs, or as printed."""
     algorithm_1_penalty: float = Field(default=0.01, gt=0.0)
     """rho of Algorithm 1 as printed, as a multiple of the loop closures' information; larger ones diverge sooner."""
     elimination_wire: Literal["float32", "float64"] = "float64"

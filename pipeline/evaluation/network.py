@@ -29,6 +29,7 @@ SOLVERS = {
     "admm": "relaxed edge-ADMM (poses), evidence sent once (Gaussians)",
     "elimination": "elimination along a tree of robots (poses), evidence sent once (Gaussians)",
     "elected": "an elected robot with all graphs (poses), evidence sent once (Gaussians)",
+    "block_descent": "block-coordinate descent, robots take turns (poses), evidence sent once (Gaussians)",
     "algorithm_1": "Algorithm 1 of the paper, corrected: matched Gaussians move poses",
     "algorithm_1_printed": "Algorithm 1 of the paper, as printed: poses and matched Gaussians move together",
 }

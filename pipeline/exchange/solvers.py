@@ -357,6 +357,10 @@ def solver_of(config: ExchangeConfig, team: int) -> SolverFactory:
             from duagc.pipeline.exchange.elected import ElectedSolver  # which needs this module
 
             return ElectedSolver(start, config.consensus, team)
+        if config.solver == "block_descent":
+            from duagc.pipeline.exchange.block_descent import BlockDescentSolver  # which needs this module
+
+            return BlockDescentSolver(start, config.consensus)
         if config.solver != "elimination":
             from duagc.pipeline.exchange.algorithm_1 import Algorithm1Solver  # which needs this module
 
