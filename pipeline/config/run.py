@@ -3,6 +3,7 @@
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.calibration import CalibrationConfig
 from duagc.pipeline.config.consensus import MapMatching
+from duagc.pipeline.config.evaluation import EvaluationConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.fusion import FusionConfig
@@ -20,6 +21,7 @@ class RunConfig(Config):
     information: InformationConfig = InformationConfig()
     exchange: ExchangeConfig = ExchangeConfig()
     fusion: FusionConfig = FusionConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
 
     @property
     def thickness_floor_m(self) -> float:

@@ -30,6 +30,8 @@ from duagc.pipeline.splat.gaussians import Gaussians
 
 COMPARED = ("own", "own_longer", "fused", "refined")
 IN_EVERY_RUN = ("own", "fused", "refined")
+CENTRAL = "central"
+"""The map trained on all robots' images; it has a section where there is one (`central_map`)."""
 MOST_VIEWS = 40
 """Of a set, unless more are asked for."""
 COMPARED_SETS = ("held_out", "peers", "team")
@@ -79,7 +81,7 @@ class _Found:
         elif kind == "own_longer" and not self.longer:
             reason = NOT_ASKED
         else:
-            reason = NONE_MET if kind in ("own_longer", "refined") else REASONS[view_set]
+            reason = NONE_MET if kind in ("own_longer", "refined", CENTRAL) else REASONS[view_set]
         return views.summary([s for r in robots for s in self.of(r, kind, view_set)], reason)
 
 
@@ -109,7 +111,7 @@ def robot_scores(
     *,
     threads: int,
     progress: bool,
-    longer: Gaussians | None,
+    further: Mapping[str, Gaussians],
     most_views: int = MOST_VIEWS,
     save: Checkpoints = NO_CHECKPOINTS,
 ) -> list[Scored]:
@@ -121,15 +123,13 @@ def robot_scores(
         name: of the robot.
         threads: views rendered at the same time; changes no bit of the result.
         progress: show it on standard error.
-        longer: its own map, trained longer, in its map frame; None: there is none.
+        further: maps besides those of the run: own_longer, in its map frame, and central, in the world.
         most_views: of a set, evenly spread; of peers' views all peers have the same share.
         save: of every set of views, when it is done.
     """
     found: list[Scored] = []
     robot = run.robots[name]
-    maps = _maps(robot)
-    if longer is not None:
-        maps["own_longer"] = longer
+    maps = {**_maps(robot), **further}
     own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
 
     def score(task: RenderTask, view_set: str, title: str) -> None:
@@ -150,11 +150,12 @@ def robot_scores(
     mapped = {kind: own[kind] for kind in ("own", "fused")}
     task = RenderTask(mapped, robot, "keyframes", robot.own_map.depth, most_views)
     score(task, "training", f"render keyframes of {name}")
-    world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in COMPARED}
+    world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in (*COMPARED, CENTRAL)}
     colors = read_peer_colors(robot.folder / "fused.mcap", name)
     peers = mates(run, robot)
     for peer in peers:
-        seen = {kind: in_colors_of(colors.get(peer.robot), g) for kind, g in world.items()}
+        here = colors.get(peer.robot)
+        seen = {kind: in_colors_of(None if kind == CENTRAL else here, g) for kind, g in world.items()}
         there = {kind: PosedMap(g, peer.trajectory) for kind, g in seen.items()}
         task = RenderTask(there, peer, "held_out", robot.own_map.depth, -(-most_views // len(peers)))
         score(task, "peers", f"render maps of {name} from {peer.robot}")
@@ -174,10 +175,13 @@ def rendering_sections(of_robots: Mapping[str, Sequence[Scored]], *, longer: boo
             found.add(name, kind, view_set, index=index, score=score)
     robots_of_run = list(of_robots)
     sets: dict[str, tuple[str, ...]] = dict.fromkeys(COMPARED, COMPARED_SETS)
+    if any(kind == CENTRAL for scored in of_robots.values() for kind, *_ in scored):
+        sets[CENTRAL] = COMPARED_SETS
     sets |= {"own_unrefined": ("held_out",)} | dict.fromkeys(("own", "fused"), (*COMPARED_SETS, "training"))
+    compared = [kind for kind in sets if kind in (*COMPARED, CENTRAL)]
     team = {kind: {s: found.summary(robots_of_run, kind, s) for s in sets[kind]} for kind in sets}
     robots = {
-        name: {kind: {s: found.summary([name], kind, s) for s in COMPARED_SETS} for kind in COMPARED}
+        name: {kind: {s: found.summary([name], kind, s) for s in COMPARED_SETS} for kind in compared}
         for name in of_robots
     }
     return RenderingSections(team, robots, found.rows)

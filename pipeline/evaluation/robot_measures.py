@@ -58,18 +58,18 @@ class RobotTask:
     most_views: int
     saved: Path | None = None
 
-    def in_worker(self, name: str, longer: Gaussians | None) -> RobotMeasures:
+    def in_worker(self, name: str, further: Mapping[str, Gaussians]) -> RobotMeasures:
         """In a process that knows nothing of the run yet.
 
         Args:
             name: of the robot.
-            longer: its own map, trained longer; None: there is none.
+            further: maps besides those of the run, by kind.
         """
         determinism.configure_opencv()
         with EVALUATION.running(self.run_dir):
             run, source = RunFolder(self.run_dir), Recording(self.recording)
             truth = TruePaths.of(run, source)
-            return self.of(name, run, source, truth=truth, longer=longer, hear=worker_reports.tell)
+            return self.of(name, run, source, truth=truth, further=further, hear=worker_reports.tell)
 
     def of(
         self,
@@ -78,7 +78,7 @@ class RobotTask:
         source: Recording,
         *,
         truth: TruePaths,
-        longer: Gaussians | None,
+        further: Mapping[str, Gaussians],
         hear: Hear,
     ) -> RobotMeasures:
         """In this process.
@@ -88,7 +88,7 @@ class RobotTask:
             run: the run.
             source: its recording.
             truth: paths next to the true ones.
-            longer: its own map, trained longer; None: there is none.
+            further: maps besides those of the run, by kind.
             hear: gets every step.
         """
 
@@ -103,7 +103,7 @@ class RobotTask:
             name,
             threads=self.threads,
             progress=self.progress,
-            longer=longer,
+            further=further,
             most_views=self.most_views,
             save=save,
         )
@@ -122,7 +122,7 @@ def measured(
     truth: TruePaths,
     *,
     workers: int,
-    own_longer: Mapping[str, Gaussians],
+    further: Mapping[str, Mapping[str, Gaussians]],
     hear: Hear,
 ) -> dict[str, RobotMeasures]:
     """Every robot, by name.
@@ -133,19 +133,19 @@ def measured(
         source: its recording.
         truth: paths next to the true ones.
         workers: robots measured at the same time, in processes of their own if more than one.
-        own_longer: own maps trained longer, by robot.
+        further: maps besides those of the run, by robot and kind.
         hear: gets every step, in another thread where there are other processes.
     """
     if min(workers, len(run.robots)) == 1:
         return {
-            name: task.of(name, run, source, truth=truth, longer=own_longer.get(name), hear=hear)
+            name: task.of(name, run, source, truth=truth, further=further.get(name, {}), hear=hear)
             for name in run.robots
         }
     with (
         worker_reports.listening(hear) as queue,
         worker_pool(min(workers, len(run.robots)), worker_reports.keep_queue, (queue,)) as pool,
     ):
-        begun = {name: pool.submit(task.in_worker, name, own_longer.get(name)) for name in run.robots}
+        begun = {name: pool.submit(task.in_worker, name, further.get(name, {})) for name in run.robots}
         return {name: result.result() for name, result in begun.items()}
 
 

@@ -19,8 +19,10 @@ from duagc.pipeline.evaluation import (
     map_errors,
     trajectory_errors,
 )
+from duagc.pipeline.evaluation.central_map import central_maps
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.rendering import (
+    CENTRAL,
     MOST_VIEWS,
     rendering_sections,
 )
@@ -114,8 +116,15 @@ def evaluate(
         raise DuagError(f"{recording}: has no robot {unknown[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
     longer, rows = own_longer or {}, list[Row]()
+    central = central_maps(run, source, threads) if run.config.evaluation.central_map else {}
+    further = {
+        name: {
+            kind: maps[name] for kind, maps in (("own_longer", longer), (CENTRAL, central)) if name in maps
+        }
+        for name in run.robots
+    }
     task = RobotTask(Path(run_dir), Path(recording), threads, progress, most_views, saved)
-    of_robots = measured(task, run, source, truth, workers=workers, own_longer=longer, hear=hear)
+    of_robots = measured(task, run, source, truth, workers=workers, further=further, hear=hear)
     hear((OF_TEAM, "team", 0, 1))
     rendering = rendering_sections({name: m.scores for name, m in of_robots.items()}, longer=bool(longer))
     tree = {

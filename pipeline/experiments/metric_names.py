@@ -46,7 +46,9 @@ def _known() -> Iterator[str]:
     ):
         yield from (f"{section}.{key}" for key in keys.split())
     of_maps = [
-        f"{map_}.{views}" for map_ in ("own", "fused", "refined") for views in ("held_out", "peers", "team")
+        f"{map_}.{views}"
+        for map_ in ("own", "fused", "refined", "central")
+        for views in ("held_out", "peers", "team")
     ]
     for views in (*of_maps, "own.training", "fused.training", "own_unrefined.held_out"):
         yield from (f"rendering.{views}.{key}" for key in _VIEWS.split())

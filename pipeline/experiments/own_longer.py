@@ -8,12 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.evaluation.central_map import camera_of, images_of
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.finetune import finetune_map, num_steps
-from duagc.pipeline.fusion.stage import training_views
-from duagc.pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
-from duagc.pipeline.runs.robot_data import AgentInput
 from duagc.pipeline.splat.gaussians import Gaussians
 
 
@@ -36,26 +35,15 @@ def own_longer(run: RunFolder, source: Recording, threads: int) -> dict[str, Gau
 
 
 def _trained(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> Gaussians:
-    log = source.log(robot.robot)
-    files = AgentInput(
-        robot.robot,
-        log,
-        robot.folder / "frontend.mcap",
-        robot.folder / "information.mcap",
-        run.config.thickness_floor_m,
-    )
     frames = [f for f in robot.frames if f.status != "lost"]
     config = run.config.fusion.finetune
     poses = np.array([f.T_map_camera for f in frames])
     own = robot.own_map
-    with open_rgbd(log) as camera_log:
-        camera = camera_log.camera
     keyframes = len(robot.keyframes)
-    num_support = config.at_most(config.support_views, keyframes)
-    views = training_views(files, frames, poses, num_support=num_support, moving=run.config.frontend.moving)
+    views = images_of(run, robot, source, poses)
     steps = sum(num_steps(config, len(views), 1, keyframes))
     context = MapContext(
-        camera,
+        camera_of(robot, source),
         FusionConfig(finetune=config.model_copy(update={"steps_per_view": steps, "steps_max": steps})),
         run.config.matching,
         own.depth,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from duagc.pipeline.evaluation.rendering import COMPARED, COMPARED_SETS
+from duagc.pipeline.evaluation.rendering import CENTRAL, COMPARED, COMPARED_SETS
 from duagc.pipeline.evaluation.results import reason_of, unit_of
 
 NONE = "–"
@@ -86,6 +86,7 @@ MAPS = {
     "own_longer": "own, trained longer",
     "fused": "fused",
     "refined": "refined (final)",
+    "central": "of all robots' images",
 }  # fmt: skip
 
 VIEW_SETS = {
@@ -231,7 +232,7 @@ def rows(
 
 def is_scored(metrics: Mapping[str, Any], kind: str) -> bool:
     """Whether a map exists in this run and was rendered at some view."""
-    return any(found["views"] for found in metrics["rendering"][kind].values())
+    return any(found["views"] for found in metrics["rendering"].get(kind, {}).values())
 
 
 def compared_sets(metrics: Mapping[str, Any]) -> list[str]:
@@ -249,7 +250,7 @@ def without_empty(
 
 def _compared(metrics: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Of all robots together and of each: name, map, its scores by set of views."""
-    kinds = [kind for kind in COMPARED if is_scored(metrics, kind)]
+    kinds = [kind for kind in (*COMPARED, CENTRAL) if is_scored(metrics, kind)]
     robots = metrics["robots"]
     if len(robots) > 1:
         yield from (("all robots", kind, metrics["rendering"][kind]) for kind in kinds)

@@ -221,7 +221,7 @@ def _rendering_content(metrics: dict[str, Any]) -> dict[str, Any]:
         (word, labels.VIEW_SETS[view_set], metrics["rendering"][kind][view_set])
         for kind, word in labels.MAPS.items()
         for view_set in labels.VIEW_SETS
-        if view_set in metrics["rendering"][kind] and metrics["rendering"][kind][view_set]["views"]
+        if metrics["rendering"].get(kind, {}).get(view_set, {}).get("views")
     ]
     columns = labels.without_empty(labels.RENDERING, [scores for _, _, scores in found])
     return {

@@ -269,6 +269,20 @@ def test_own_maps_are_trained_longer_only_if_asked(metrics, tmp_path):
     assert {k: asked["rendering"][k] for k in others} == {k: metrics["rendering"][k] for k in others}
 
 
+def test_one_map_of_all_images_is_scored_only_if_asked(metrics, tmp_path):
+    fake = make(tmp_path)
+    settings = fake.run / "config.toml"
+    settings.write_text(settings.read_text() + "\n[evaluation]\ncentral_map = true\n")
+    asked = evaluate(fake.run, fake.recording, progress=False)
+    assert "central" not in metrics["rendering"]
+    central, own = asked["rendering"].pop("central"), asked["rendering"]["own"]
+    assert central["team"]["views"] == own["team"]["views"] > 0
+    alpha, bravo = (asked["robots"][robot]["rendering"].pop("central") for robot in ("alpha", "bravo"))
+    assert alpha["peers"] == bravo["held_out"] != alpha["held_out"]  # it is one map
+    assert central["held_out"]["psnr_db"] != own["held_out"]["psnr_db"]
+    assert asked["rendering"] == metrics["rendering"]
+
+
 def test_without_ground_truth_there_are_reasons_not_numbers(tmp_path):
     fake = make(tmp_path, truth=False)
     metrics = evaluate(fake.run, fake.recording, progress=False)

@@ -1,0 +1,13 @@
+"""Settings of the evaluation."""
+
+from __future__ import annotations
+
+from duagc.pipeline.config.base import Config
+
+
+class EvaluationConfig(Config):
+    """What a run is measured against."""
+
+    central_map: bool = False
+    """Also train and score one map from the maps and images of all robots that share a world, as a server would that
+    gets them all; with the agreed poses, and as many steps as all final maps together."""
