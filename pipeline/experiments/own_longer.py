@@ -42,9 +42,11 @@ def _trained(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -
     keyframes = len(robot.keyframes)
     views = images_of(run, robot, source, poses)
     steps = sum(num_steps(config, len(views), 1, keyframes))
+    # `finetune_map` makes more of it for a long log, as `num_steps` did
+    most = -(-steps * config.keyframes // max(keyframes, config.keyframes))
     context = MapContext(
         camera_of(robot, source),
-        FusionConfig(finetune=config.model_copy(update={"steps_per_view": steps, "steps_max": steps})),
+        FusionConfig(finetune=config.model_copy(update={"steps_per_view": steps, "steps_max": most})),
         run.config.matching,
         own.depth,
         threads=threads,
