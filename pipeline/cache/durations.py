@@ -192,8 +192,7 @@ def _final_steps(size: Size, mapping: MappingConfig) -> float:
         min(keyframes + mapping.support_views, size["frames"] / tiles)
         + (not whole) * mapping.border_keyframes
     )
-    steps = max(mapping.final_iterations * keyframes, mapping.final_iterations_view * views)
-    return tiles * min(steps, mapping.final_iterations_max)
+    return tiles * mapping.final_steps(keyframes, views)
 
 
 def _trained_views(size: Size, mapping: MappingConfig) -> int:

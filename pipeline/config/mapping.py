@@ -131,3 +131,13 @@ class MappingConfig(Config):
         if self.depth != "auto":
             return self.depth
         return "ray_plane" if depth_noise_m is not None and depth_noise_m < self.exact_depth_m else "blended"
+
+    def final_steps(self, keyframes: float, views: float) -> float:
+        """Steps of the final optimization of a tile, without a budget.
+
+        Args:
+            keyframes: of the tile.
+            views: that it is optimized with, keyframes too.
+        """
+        wanted = max(self.final_iterations * keyframes, self.final_iterations_view * views)
+        return min(wanted, self.final_iterations_max)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,12 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.geometry.view_extent import radii_m
 from duagc.pipeline.kernels import CompiledAdam, Gradients
+from duagc.pipeline.kernels.training import step_rows
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import TRAINED
 
 Indices = NDArray[np.int64]
-TakeStep = Callable[[Gaussians, Gradients, CompiledAdam], Gaussians]
+TakeStep = Callable[[Gradients, Gaussians, CompiledAdam], Gaussians]
 FADING = 0.9
 """Share of its last contribution that a Gaussian keeps where it is not measured again."""
 
@@ -181,37 +183,20 @@ class GrowingMap:
         Args:
             guests: rows [m] of the guests that it may see.
             gradients: of a loss by `seen_with(guests)`.
-            take: gives Gaussians after the step, from them, their gradients and the state of their optimizer.
+            take: gives Gaussians after the step, from their gradients, them and the state of their optimizer.
             keep_guests: whether guests stay as they are.
         """
         count = len(guests)
-        self._step_of(self._own, gradients, slice(count, None), take)
+        parts: list[tuple[slice | Indices, slice]] = [(self._own, slice(count, None))]
         if count and not keep_guests:
-            self._step_of(guests, gradients, slice(count), take)
-
-    def step_of(self, rows: Indices, gradients: Gradients, take: TakeStep) -> None:
-        """Take an optimization step of some Gaussians, in place.
-
-        Args:
-            rows: [m], which.
-            gradients: of a loss by them.
-            take: as of `step`.
-        """
-        self._step_of(rows, gradients, slice(None), take)
+            parts.append((guests, slice(count)))
+        for rows, part in parts:
+            of_rows = {name: np.ascontiguousarray(getattr(gradients, name)[part]) for name in TRAINED}
+            step_rows(self.gaussians, self.adam, rows, partial(take, replace(gradients, **of_rows)))
 
     @property
     def _own(self) -> slice:
         return slice(self.guests, None)
-
-    def _step_of(self, rows: slice | Indices, gradients: Gradients, part: slice, take: TakeStep) -> None:
-        """Take a step of some rows, of which a part of the gradients is."""
-        adam = self.adam.part(rows)
-        of_rows = {name: np.ascontiguousarray(getattr(gradients, name)[part]) for name in TRAINED}
-        stepped = take(self.gaussians.select(rows), replace(gradients, **of_rows), adam)
-        for name in TRAINED:
-            getattr(self.gaussians, name)[rows] = getattr(stepped, name)
-        if not isinstance(rows, slice):
-            self.adam.put(rows, adam)
 
     @property
     def is_guest(self) -> NDArray[np.bool_]:

@@ -23,9 +23,10 @@ from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.view_poses import PoseSteps
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
-from duagc.pipeline.kernels.training import TrainingStep, TrainingView
+from duagc.pipeline.kernels.training import TrainingStep, TrainingView, step_rows
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.map_cells import MapCells
 from duagc.pipeline.splat.optimizer import smoothstep_decay
@@ -40,14 +41,14 @@ class JointView:
         T_map_camera: [4, 4], its pose at first.
         information: [6, 6] of the pose, by tracking (right tangent: translation m, rotation rad).
         fixed: whether the pose stays.
-        read: gives its images.
+        read: gives its images; the pose they have there is not used.
     """
 
     frame_index: int
     T_map_camera: Array
     information: Array
     fixed: bool
-    read: Callable[[], TrainingView]
+    read: Callable[[], PosedRgbd]
 
 
 class JointTraining:
@@ -76,6 +77,7 @@ class JointTraining:
         self._views, self._camera, self._config, self._seed = views, camera, config, seed
         weights = LossWeights(**config.loss.of(depth).model_dump())
         self._step = TrainingStep(Rasterizer(threads=threads), weights, depth)
+        self._huber_m = weights.depth_huber_m
         self._refined = config.pose_rate > 0 and depth != "ray_plane"
         self._pose_steps = PoseSteps([view.information for view in views])
         self._T_map_camera = np.array([view.T_map_camera for view in views])
@@ -108,13 +110,10 @@ class JointTraining:
         in_all = round(steps / config.joint_share)  # as if tiles were no more than the beginning of it
         begun = in_all - steps
         sparse = SparseSteps(config.sparse, self._camera, in_all)
+        turns = random_streams.in_turn(self._seed, "mapping.joint", count, first=first)
         for step in range(first, steps):
-            position = step % count
-            if position == 0 or step == first:
-                start = step - position
-                order = random_streams.generator(self._seed, "mapping.joint", start=start).permutation(count)
-            chosen = int(order[position])
-            looked_at = sparse.at(begun + step, visit=step // count + chosen)
+            chosen, visit = next(turns)
+            looked_at = sparse.at(begun + step, visit)
             share = smoothstep_decay(begun + step, in_all, config.final_rate_decay)
             self._take_step(whole, cells, chosen, share=share, looked_at=looked_at)
             state = partial(self._state, cells, whole)
@@ -139,17 +138,20 @@ class JointTraining:
         self, whole: GrowingMap, cells: MapCells, chosen: int, *, share: float, looked_at: LookedAt
     ) -> None:
         """One step of what a view may see, and of its pose."""
-        view, T_map_camera = self._views[chosen].read(), self._T_map_camera[chosen]
+        T_map_camera = self._T_map_camera[chosen]
+        posed = replace(self._views[chosen].read(), T_world_camera=T_map_camera)
+        view = TrainingView.of(posed, self._huber_m)
         rows = cells.seen(view.depth_m, T_map_camera, self._camera)
         moves = self._refined and not self._views[chosen].fixed
         loss, gradients = self._step.gradients(
             whole.gaussians.select(rows),
             self._camera,
-            looked_at.of(replace(view, T_map_camera=T_map_camera)),
+            looked_at.of(view),
             pose=moves,
             closing=looked_at.closing,
         )
-        whole.step_of(rows, gradients, partial(self._stepped, rates=self._config.rates.times(share)))
+        take = partial(self._stepped, gradients, rates=self._config.rates.times(share))
+        step_rows(whole.gaussians, whole.adam, rows, take)
         if moves:
             assert gradients.pose is not None  # it was asked for
             tangent = self._pose_steps.step(chosen, gradients.pose, self._config.pose_rate * share)
@@ -160,7 +162,7 @@ class JointTraining:
         return cells, self._pose_steps.state(), self._T_map_camera, self._losses, whole.state()
 
     def _stepped(
-        self, gaussians: Gaussians, gradients: Gradients, adam: CompiledAdam, *, rates: LearningRates
+        self, gradients: Gradients, gaussians: Gaussians, adam: CompiledAdam, *, rates: LearningRates
     ) -> Gaussians:
         least = np.float32(np.log(self._config.seeding.thickness_m))
         return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, least_log_scales=least)

@@ -23,7 +23,7 @@ from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.joint_training import JointTraining, JointView
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 from duagc.pipeline.frontend.mapping_budget import MappingBudget, alone_steps
-from duagc.pipeline.frontend.mapping_views import training_view
+from duagc.pipeline.frontend.mapping_views import masked_depth
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.output import BuiltMap, Maps
 from duagc.pipeline.frontend.supporting_frames import supporting_frames
@@ -33,8 +33,8 @@ from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.exposure import ExposureTrack
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.view_extent import ViewExtent
-from duagc.pipeline.kernels.training import TrainingView
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration.moving import FreeSpace
@@ -301,18 +301,11 @@ class MapBuilder:
     ) -> JointView:
         """A view, whose images are read when they are looked at; what moves is known by its pose before refinement."""
 
-        def read() -> TrainingView:
+        def read() -> PosedRgbd:
             frame = self.log.frame(frame_index)
             mask = self._free.usable(frame.usable_depth, T_map_tracked, frame.mask)
-            return training_view(
-                frame.color,
-                frame.depth,
-                T_map_tracked,
-                mask=mask,
-                depth_sigma_m=frame.depth_sigma,
-                huber_m=self.config.mapping.loss.of(self._depth).depth_huber_m,
-                exposure=self.exposures.at(frame_index),
-            )
+            depth_m, exposure = masked_depth(frame.depth, mask), self.exposures.at(frame_index)
+            return PosedRgbd(frame.color, depth_m, T_map_tracked, mask, frame.depth_sigma, exposure)
 
         return JointView(frame_index, self._poses[frame_index], information, fixed, read)
 

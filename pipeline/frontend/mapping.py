@@ -277,11 +277,8 @@ class Mapper(MapContent):
         if found is not None:
             poses.go_on(found[1])
             self.go_on(found[2])
+        turns = random_streams.in_turn(self.seed, "mapping.finish", len(views), first=first, **self._of_tile)
         for step in range(first, alone):
-            position = step % len(views)
-            if position == 0 or step == first:
-                start = step - position
-                order = self._draw_of(start).permutation(len(views))
             if step in rounds:
                 number = rounds.index(step)
                 half = views[number % 2 :: 2] if len(views) >= MANY_VIEWS else views
@@ -290,11 +287,11 @@ class Mapper(MapContent):
             elif step == last_prune:
                 pruned += self._prune_useless(views, len(views))
             share = smoothstep_decay(step, steps, config.final_rate_decay)
-            chosen = int(order[position])
+            chosen, visit = next(turns)
             pose_step = (
                 poses.of(chosen, config.pose_rate * share) if refined and chosen not in fixed else None
             )
-            looked_at = sparse.at(step, visit=step // len(views) + chosen)
+            looked_at = sparse.at(step, visit)
             rates = config.rates.times(share)
             self._optimize(views[chosen], 0, rates, looked_at, pose_step=pose_step, keep_guests=True)
             state = partial(self._optimized, (before, inserted, pruned), poses)
@@ -307,10 +304,10 @@ class Mapper(MapContent):
         borders = set(range(views - len(self._borders), views))
         return borders if borders and self._views[0].index else borders | {0}
 
-    def _draw_of(self, start: int) -> np.random.Generator:
-        """The stream of the order of the views from a step on."""
-        of_tile = {"tile": self._tile} if self._tile else {}
-        return random_streams.generator(self.seed, "mapping.finish", start=start, **of_tile)
+    @property
+    def _of_tile(self) -> dict[str, int]:
+        """The key of the stream of the order of the views."""
+        return {"tile": self._tile} if self._tile else {}
 
     def _optimized(self, so_far: tuple[float, int, int], poses: PoseSteps) -> tuple[Any, ...]:
         """From which the final optimization can go on."""
@@ -350,7 +347,7 @@ class Mapper(MapContent):
         if self._map.guests:
             self._map.step(self._guests(view), gradients, take, keep_guests=keep_guests)
         else:
-            self._map.gaussians = take(self._map.gaussians, gradients, self._map.adam)
+            self._map.gaussians = take(gradients, self._map.gaussians, self._map.adam)
         if pose_step is not None:
             assert gradients.pose is not None  # it was asked for
             view.T_map_camera = view.T_map_camera @ se3.exp(pose_step(gradients.pose))
@@ -358,8 +355,8 @@ class Mapper(MapContent):
 
     def _stepped(
         self,
-        gaussians: Gaussians,
         gradients: Gradients,
+        gaussians: Gaussians,
         adam: CompiledAdam,
         *,
         rates: LearningRates,

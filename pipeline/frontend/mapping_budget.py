@@ -45,8 +45,7 @@ class MappingBudget:
             log_s: time that the log took to record.
         """
         config, sparse = self.config, self.config.sparse
-        wanted = max(config.final_iterations * keyframes, config.final_iterations_view * views)
-        wanted = min(wanted, config.final_iterations_max)
+        wanted = int(config.final_steps(keyframes, views))
         if config.final_megapixels_s is None:
             return wanted, wanted
         seen = 1 - 0.5 * sparse.until if sparse.checkerboard else 1.0

@@ -137,33 +137,6 @@ class View:
         return self.mask if level == 0 else self.half_mask
 
 
-def training_view(
-    color: Bytes,
-    depth_m: Image,
-    T_map_camera: NDArray[np.float64],
-    *,
-    mask: NDArray[np.bool_] | None,
-    depth_sigma_m: Image | None,
-    huber_m: float,
-    exposure: Exposure | None,
-) -> TrainingView:
-    """The full-size images of a view as a training step takes them, without keeping them.
-
-    Args:
-        color: as of `View.of`.
-        depth_m: as of `View.of`.
-        T_map_camera: as of `View.of`.
-        mask: as of `View.of`.
-        depth_sigma_m: as of `View.of`.
-        huber_m: as of `View.of`.
-        exposure: as of `View.of`.
-    """
-    certainty = None if depth_sigma_m is None else depth_certainty(depth_sigma_m, huber_m)
-    return TrainingView(
-        unit_color(color, exposure), masked_depth(depth_m, mask), T_map_camera, mask, certainty
-    )
-
-
 def masked_depth(depth_m: Image, mask: NDArray[np.bool_] | None) -> Image:
     """Depth [H, W], meters, 0 where a mask forbids the pixel.
 

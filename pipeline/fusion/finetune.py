@@ -11,8 +11,7 @@ before: what is learned here comes from the same pixels and is not counted again
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -27,9 +26,8 @@ from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
-from duagc.pipeline.kernels.training import TrainingStep, TrainingView
+from duagc.pipeline.kernels.training import TrainingStep, TrainingView, step_rows
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.losses import depth_certainty
 from duagc.pipeline.splat.map_cells import MapCells
 from duagc.pipeline.splat.optimizer import TRAINED, smoothstep_decay
 
@@ -59,6 +57,7 @@ def finetune_map(
     trained: NDArray[np.bool_] | None = None,
     peer_views: Sequence[PosedRgbd] = (),
     keyframes: int = 0,
+    steps: tuple[int, int] | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> Gaussians:
     """The map after some training steps, each on one view.
@@ -73,20 +72,21 @@ def finetune_map(
         trained: bool [n], which of the Gaussians may change; None: all.
         peer_views: as peers' maps show them.
         keyframes: of the robot: of a longer log there are more steps.
+        steps: on own views and on views of peers' maps; None: as of `num_steps`.
         checkpoints: of the stage.
     Returns:
         As many Gaussians, in the same order, with the same ids and anchors.
     """
     config = context.config.finetune
-    own_steps, peer_steps = num_steps(config, len(views), len(peer_views), keyframes)
+    own_steps, peer_steps = steps or num_steps(config, len(views), len(peer_views), keyframes)
     if not own_steps or not len(gaussians):
         return gaussians
     total = own_steps + peer_steps
     head = max(peer_steps, round(PEERS_UNTIL * total))
     training = _Training(gaussians, context, trained, in_parts=keyframes > config.keyframes)
     # the streams keep the names that they had: under other names they would draw other views
-    own = _in_turn(views, context.seed, "fusion.refine")
-    peer = _in_turn(peer_views, context.seed, "fusion.refine.peers")
+    own = random_streams.in_turn(context.seed, "fusion.refine", len(views))
+    peer = random_streams.in_turn(context.seed, "fusion.refine.peers", len(peer_views))
     sparse = SparseSteps(config.sparse, context.camera, total)
     first = 0
     if (saved := checkpoints.resume(PART)) is not None:
@@ -94,10 +94,11 @@ def finetune_map(
         training.go_on(state)
     for step in range(total):
         of_peer = step < head and (step + 1) * peer_steps // head > step * peer_steps // head
-        view, visit = next(peer if of_peer else own)
+        number, visit = next(peer if of_peer else own)
         if step < first:
             continue  # its view was taken by the process before
         share = config.rate * smoothstep_decay(step, total, config.rate_decay)
+        view = (peer_views if of_peer else views)[number]
         training.step(view, sparse.at(step, visit), config.rates.times(share))
         checkpoints.at(PART, step + 1, total, training.state)
     return training.gaussians
@@ -139,22 +140,20 @@ class _Training:
         """Take a step on a view."""
         take = partial(self._stepped, looked_at=looked_at, view=view, rates=rates)
         if self._cells is None:
-            self.gaussians = take(self.gaussians, self._adam, self._floor, self._trained)
+            self.gaussians = take(self.gaussians, self._adam, floor=self._floor, trained=self._trained)
             return
         rows = self._cells.seen(view.depth_m, view.T_world_camera, self._camera)
-        part, adam = self.gaussians.select(rows), self._adam.part(rows)
-        stepped = take(part, adam, self._floor[rows], None if self._trained is None else self._trained[rows])
-        for name in TRAINED:
-            getattr(self.gaussians, name)[rows] = getattr(stepped, name)
-        self._adam.put(rows, adam)
+        trained = None if self._trained is None else self._trained[rows]
+        take = partial(take, floor=self._floor[rows], trained=trained)
+        step_rows(self.gaussians, self._adam, rows, take)
 
     def _stepped(
         self,
         gaussians: Gaussians,
         adam: CompiledAdam,
+        *,
         floor: NDArray[np.float32],
         trained: NDArray[np.bool_] | None,
-        *,
         view: PosedRgbd,
         looked_at: LookedAt,
         rates: LearningRates,
@@ -162,26 +161,13 @@ class _Training:
         stepped, _ = self._take(
             gaussians,
             self._camera,
-            looked_at.of(_training_view(view, self._huber_m)),
+            looked_at.of(TrainingView.of(view, self._huber_m)),
             adam=adam,
             rates=rates,
             least_log_scales=floor,
             closing=looked_at.closing,
         )
         return stepped if trained is None else _where(trained, stepped, gaussians)
-
-
-def _training_view(view: PosedRgbd, huber_m: float) -> TrainingView:
-    certainty = None if view.depth_sigma_m is None else depth_certainty(view.depth_sigma_m, huber_m)
-    return TrainingView(view.unit_color, view.depth_m, view.T_world_camera, view.mask, certainty)
-
-
-def _in_turn(views: Sequence[PosedRgbd], seed: int, stream: str) -> Iterator[tuple[PosedRgbd, int]]:
-    """The views without end, in random order, each once before any comes again; and the number of the visit."""
-    for visit in itertools.count():
-        start = visit * max(1, len(views))
-        for k in random_streams.generator(seed, stream, start=start).permutation(len(views)):
-            yield views[k], visit + int(k)
 
 
 def _where(chosen: NDArray[np.bool_], a: Gaussians, b: Gaussians) -> Gaussians:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +11,13 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.training import DepthKind, LearningRates
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels.adam import CompiledAdam
 from duagc.pipeline.kernels.rasterizer import Rasterizer
 from duagc.pipeline.kernels.types import Gradients, LossWeights, ViewLoss
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.losses import depth_certainty
+from duagc.pipeline.splat.optimizer import TRAINED
 
 Image = NDArray[np.float32]
 LARGEST_LOGIT = 6.0
@@ -37,6 +41,17 @@ class TrainingView:
     T_map_camera: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
     depth_certainty: Image | None = None
+
+    @classmethod
+    def of(cls, view: PosedRgbd, huber_m: float) -> TrainingView:
+        """An image as it was taken, in the colors of the map.
+
+        Args:
+            view: the image.
+            huber_m: depth sigmas up to it change nothing.
+        """
+        certainty = None if view.depth_sigma_m is None else depth_certainty(view.depth_sigma_m, huber_m)
+        return cls(view.unit_color, view.depth_m, view.T_world_camera, view.mask, certainty)
 
 
 @dataclass(frozen=True)
@@ -136,3 +151,25 @@ class TrainingStep:
             log_scales=np.maximum(stepped.log_scales, least_log_scales),
             opacity_logits=np.clip(stepped.opacity_logits, -limit, limit),
         )
+
+
+def step_rows(
+    gaussians: Gaussians,
+    adam: CompiledAdam,
+    rows: slice | NDArray[np.int64],
+    take: Callable[[Gaussians, CompiledAdam], Gaussians],
+) -> None:
+    """Take a step of some Gaussians in place.
+
+    Args:
+        gaussians: of which some are changed.
+        adam: state of the optimization of all of them; changed.
+        rows: which.
+        take: gives these after the step, from what they are and the state of their optimization.
+    """
+    of_rows = adam.part(rows)
+    stepped = take(gaussians.select(rows), of_rows)
+    for name in TRAINED:
+        getattr(gaussians, name)[rows] = getattr(stepped, name)
+    if not isinstance(rows, slice):
+        adam.put(rows, of_rows)

@@ -8,10 +8,9 @@ from duagc.pipeline.evaluation.image_metrics import psnr
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.joint_training import JointTraining, JointView
 from duagc.pipeline.frontend.mapping import Mapper
-from duagc.pipeline.frontend.mapping_views import training_view
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
-from duagc.pipeline.kernels.training import TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from tests.frontend.test_mapping import CAMERA, POSES, same, shot
 
@@ -36,13 +35,8 @@ def _views(T_camera_tracked: np.ndarray) -> list[JointView]:
     def view(k: int) -> JointView:
         color, depth_m = shot(POSES[k])
 
-        def read() -> TrainingView:
-            return training_view(
-                color, depth_m, POSES[k], mask=None, depth_sigma_m=None, huber_m=0.02, exposure=None
-            )
-
         tracked = POSES[k] if k == 0 else POSES[k] @ T_camera_tracked
-        return JointView(10 * k, tracked, INFORMATION, k == 0, read)
+        return JointView(10 * k, tracked, INFORMATION, k == 0, lambda: PosedRgbd(color, depth_m, POSES[k]))
 
     return [view(k) for k in range(4)]
 

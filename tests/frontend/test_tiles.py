@@ -164,7 +164,7 @@ def test_a_step_of_what_a_view_sees_is_that_of_all(keep_guests: bool) -> None:
     seen = np.flatnonzero((step.gradients(part.gaussians, CAMERA, view)[1].colors[:count] != 0).any(axis=1))
     assert 0 < len(seen) < count < len(part)
 
-    def take(gaussians: Gaussians, gradients: Gradients, adam: CompiledAdam) -> Gaussians:
+    def take(gradients: Gradients, gaussians: Gaussians, adam: CompiledAdam) -> Gaussians:
         return step.stepped(gaussians, gradients, adam=adam, rates=config.rates, least_log_scales=least)
 
     for _ in range(3):
@@ -173,7 +173,7 @@ def test_a_step_of_what_a_view_sees_is_that_of_all(keep_guests: bool) -> None:
         _, gradients = step.gradients(maps[1].gaussians, CAMERA, view)
         for array in (gradients.colors, gradients.opacity_logits):
             array[: count if keep_guests else 0] = 0
-        maps[1].gaussians = take(maps[1].gaussians, gradients, maps[1].adam)
+        maps[1].gaussians = take(gradients, maps[1].gaussians, maps[1].adam)
     assert same(part.gaussians, maps[1].gaussians)
     assert all(np.array_equal(a, b) for a, b in zip(*(m.adam.state()[1].values() for m in maps), strict=True))
     begun = take_tile(_grown(2), [1], _sights([1]), []).gaussians
