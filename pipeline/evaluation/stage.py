@@ -19,7 +19,6 @@ from duagc.pipeline.evaluation import (
     map_errors,
     trajectory_errors,
 )
-from duagc.pipeline.evaluation.central_map import central_maps
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.rendering import (
     CENTRAL,
@@ -115,8 +114,11 @@ def evaluate(
     if unknown:
         raise DuagError(f"{recording}: has no robot {unknown[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
-    longer, rows = own_longer or {}, list[Row]()
-    central = central_maps(run, source, threads) if run.config.evaluation.central_map else {}
+    longer, central, rows = own_longer or {}, dict[str, Gaussians](), list[Row]()
+    if run.config.evaluation.central_map:
+        from duagc.pipeline.evaluation.central_map import central_maps
+
+        central = central_maps(run, source, threads)
     further = {
         name: {
             kind: maps[name] for kind, maps in (("own_longer", longer), (CENTRAL, central)) if name in maps

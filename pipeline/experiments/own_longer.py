@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from duagc.pipeline.config.fusion import FusionConfig
-from duagc.pipeline.evaluation.central_map import camera_of, images_of
-from duagc.pipeline.fusion.context import MapContext
-from duagc.pipeline.fusion.finetune import finetune_map, num_steps
+from duagc.pipeline.evaluation.longer_training import camera_of, context_of, images_of, steps_of_final_map
+from duagc.pipeline.fusion.finetune import finetune_map
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -35,21 +33,10 @@ def own_longer(run: RunFolder, source: Recording, threads: int) -> dict[str, Gau
 
 
 def _trained(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> Gaussians:
-    frames = [f for f in robot.frames if f.status != "lost"]
-    config = run.config.fusion.finetune
-    poses = np.array([f.T_map_camera for f in frames])
-    own = robot.own_map
-    keyframes = len(robot.keyframes)
+    poses = np.array([f.T_map_camera for f in robot.frames if f.status != "lost"])
     views = images_of(run, robot, source, poses)
-    steps = sum(num_steps(config, len(views), 1, keyframes))
-    # `finetune_map` makes more of it for a long log, as `num_steps` did
-    most = -(-steps * config.keyframes // max(keyframes, config.keyframes))
-    context = MapContext(
-        camera_of(robot, source),
-        FusionConfig(finetune=config.model_copy(update={"steps_per_view": steps, "steps_max": most})),
-        run.config.matching,
-        own.depth,
-        threads=threads,
-        seed=run.config.seed,
+    context = context_of(run, camera_of(robot, source), robot.own_map.depth, threads)
+    steps = steps_of_final_map(run, robot, views)
+    return finetune_map(
+        robot.own_map.gaussians, views, context, keyframes=len(robot.keyframes), steps=(steps, 0)
     )
-    return finetune_map(own.gaussians, views, context, keyframes=keyframes)
