@@ -33,15 +33,8 @@ from duagc.pipeline.consensus.admm_edge import PosePacket, rounded
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.exchange.matched_pairs import MatchedPairs, moved
 from duagc.pipeline.exchange.solvers import LinkStart, Matcher, SolverStart
-from duagc.pipeline.exchange.wire.algorithm_1_wire import (
-    Setup,
-    read_means,
-    read_pairs,
-    read_setup,
-    write_means,
-    write_pairs,
-    write_setup,
-)
+from duagc.pipeline.exchange.wire.algorithm_1_wire import read_means, read_pairs, write_means, write_pairs
+from duagc.pipeline.exchange.wire.link_setup_wire import LinkSetup, read_setup, write_setup
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.network.packets import MalformedError
@@ -116,7 +109,7 @@ class Algorithm1Solver:
 
     def _setup(self, link: LinkStart) -> bytes:
         kept = [c for c, keep in zip(link.closures, link.keep.tolist(), strict=True) if keep]
-        return write_setup(Setup(self._x, tuple(kept)))
+        return write_setup(LinkSetup(self._x, tuple(kept)))
 
     # --- one round
 
@@ -291,7 +284,7 @@ class Algorithm1Solver:
                 if peer is None:
                     raise MalformedError("Algorithm 1: from a robot that is not joined")
                 if peer.poses is None:
-                    self._take_setup(peer, read_setup(payload, len(self._x)))
+                    self._take_setup(peer, read_setup(payload, len(self._x), "Algorithm 1"))
                 elif not self._matcher.is_here(sender):
                     later.append((sender, payload))
                 elif self.own > sender and peer.pairs is None:
@@ -300,7 +293,7 @@ class Algorithm1Solver:
                 self.refused.append(str(error))
         self._arrived = later
 
-    def _take_setup(self, peer: _Peer, setup: Setup) -> None:
+    def _take_setup(self, peer: _Peer, setup: LinkSetup) -> None:
         kept = [c for c, keep in zip(peer.link.closures, peer.link.keep.tolist(), strict=True) if keep]
         closures: list[LoopClosure] = [*kept, *(c.reversed() for c in setup.closures)]
         own = [c.own_keyframe for c in closures]

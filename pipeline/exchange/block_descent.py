@@ -27,8 +27,8 @@ from duagc.pipeline.consensus.admm_edge import STEADY, PosePacket, rounded
 from duagc.pipeline.consensus.own_block import minimized
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.exchange.solvers import LinkStart, SolverStart
-from duagc.pipeline.exchange.wire.algorithm_1_wire import Setup
 from duagc.pipeline.exchange.wire.block_descent_wire import ClosureWeights, read_message, write_message
+from duagc.pipeline.exchange.wire.link_setup_wire import LinkSetup
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import MalformedError
@@ -127,7 +127,7 @@ class BlockDescentSolver:
         peer.poses = link.T_world_keyframe[peer.theirs].copy()
         first_mu = self.config.team_schedule().first_mu
         peer.robust = RobustWeights(link.keep.astype(np.float64), self.config, first_mu=first_mu)
-        self._outbox.append((index, write_message(Setup(self._x, link.closures))))
+        self._outbox.append((index, write_message(LinkSetup(self._x, link.closures))))
         self._send_weights(index, peer)
 
     def _send_weights(self, index: int, peer: _Peer) -> None:
@@ -250,8 +250,8 @@ class BlockDescentSolver:
                 self.refused.append(str(error))
         self._arrived.clear()
 
-    def _take(self, peer: _Peer, message: Setup | ClosureWeights) -> None:
-        if isinstance(message, Setup):
+    def _take(self, peer: _Peer, message: LinkSetup | ClosureWeights) -> None:
+        if isinstance(message, LinkSetup):
             if peer.poses is not None:
                 raise MalformedError("block descent: loop closures came twice")
             if peer.version >= 0 and len(message.closures) != len(peer.weights):

@@ -16,15 +16,8 @@ from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.rounds import run_rounds
 from duagc.pipeline.exchange.session import run_session_of, team_of
-from duagc.pipeline.exchange.wire.algorithm_1_wire import (
-    Setup,
-    read_means,
-    read_pairs,
-    read_setup,
-    write_means,
-    write_pairs,
-    write_setup,
-)
+from duagc.pipeline.exchange.wire.algorithm_1_wire import read_means, read_pairs, write_means, write_pairs
+from duagc.pipeline.exchange.wire.link_setup_wire import LinkSetup, read_setup, write_setup
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.link_model import LinkModel
 from duagc.pipeline.network.packets import MalformedError
@@ -106,17 +99,17 @@ def test_a_session_comes_out_again(team: dict[str, Any], solver: Any, tmp_path: 
 
 def test_messages_are_read_as_they_were_written() -> None:
     closure = LoopClosure(1, 0, se3.exp(np.arange(6) * 0.1), np.diag(np.arange(1.0, 7.0)), True)
-    setup = Setup(np.stack([np.eye(4), se3.exp(np.ones(6))]), (closure,))
+    setup = LinkSetup(np.stack([np.eye(4), se3.exp(np.ones(6))]), (closure,))
     data = write_setup(setup)
-    read = read_setup(data, 1)
+    read = read_setup(data, 1, "Algorithm 1")
     assert np.array_equal(read.poses, setup.poses)
     assert read.closures[0].measured_from_peer
     assert np.array_equal(read.closures[0].information, closure.information)
     for bad in (data[:-1], data + b"\0", data[:4] + b"\2" + data[5:]):
         with pytest.raises((MalformedError, ValueError)):
-            read_setup(bad, 1)
-    with pytest.raises(MalformedError, match="does not exist"):
-        read_setup(data, 0)
+            read_setup(bad, 1, "Algorithm 1")
+    with pytest.raises(MalformedError, match="descent: a loop closure of a keyframe that does not exist"):
+        read_setup(data, 0, "block descent")
     assert read_pairs(write_pairs(np.array([[1, 2], [3, 4]]))).tolist() == [[1, 2], [3, 4]]
     means = np.random.default_rng(0).normal(size=(200, 3))
     parts = [read_means(part, 200) for part in write_means(means, 1000)]

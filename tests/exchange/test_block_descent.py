@@ -15,8 +15,8 @@ from duagc.pipeline.consensus.own_block import minimized
 from duagc.pipeline.exchange.injection import DETAIL
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of
-from duagc.pipeline.exchange.wire.algorithm_1_wire import Setup
 from duagc.pipeline.exchange.wire.block_descent_wire import ClosureWeights, read_message, write_message
+from duagc.pipeline.exchange.wire.link_setup_wire import LinkSetup
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph import least_squares
@@ -57,9 +57,9 @@ def test_a_block_goes_to_its_minimum_and_never_up() -> None:
 def test_messages_are_read_as_they_were_written() -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     closure = LoopClosure(2, 1, np.eye(4), INFORMATION)
-    setup = write_message(Setup(poses, (closure,)))
+    setup = write_message(LinkSetup(poses, (closure,)))
     read = read_message(setup, 2)
-    assert isinstance(read, Setup)
+    assert isinstance(read, LinkSetup)
     assert (read.closures[0].own_keyframe, read.closures[0].peer_keyframe) == (2, 1)
     weights = write_message(ClosureWeights(3, True, np.array([0.0, 0.25])))
     back = read_message(weights, 2)

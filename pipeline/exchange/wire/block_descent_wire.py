@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.exchange.wire.algorithm_1_wire import Setup, read_setup, write_setup
+from duagc.pipeline.exchange.wire.link_setup_wire import LinkSetup, read_setup, write_setup
 from duagc.pipeline.exchange.wire.state_wire import Reader, array_bytes
 from duagc.pipeline.network.packets import MalformedError
 
@@ -29,19 +29,19 @@ class ClosureWeights:
     weights: Array
 
 
-def write_message(message: Setup | ClosureWeights) -> bytes:
+def write_message(message: LinkSetup | ClosureWeights) -> bytes:
     """Bytes of a message.
 
     Args:
         message: the first one of a link, or weights.
     """
-    if isinstance(message, Setup):
+    if isinstance(message, LinkSetup):
         return _SETUP + write_setup(message)
     head = _COUNT.pack(_WEIGHTS[0], message.version, message.final, len(message.weights))
     return head + array_bytes(message.weights, "float64")
 
 
-def read_message(data: bytes, keyframes: int) -> Setup | ClosureWeights:
+def read_message(data: bytes, keyframes: int) -> LinkSetup | ClosureWeights:
     """From `write_message`.
 
     Args:
@@ -52,7 +52,7 @@ def read_message(data: bytes, keyframes: int) -> Setup | ClosureWeights:
         MalformedError: it is not what it should be.
     """
     if data[:1] == _SETUP:
-        return read_setup(data[1:], keyframes)
+        return read_setup(data[1:], keyframes, "block descent")
     reader = Reader(data, "weights")
     code, version, final, count = reader.fields(_COUNT)
     if code != _WEIGHTS[0] or final > 1:
