@@ -328,7 +328,8 @@ def check_edges(robot: str, edges: DepthEdges | None, config: EdgeChecks) -> Ite
             f"edges of color fit the depth {abs(shift)} frames {'later' if shift > 0 else 'earlier'} better by "
             f"{edges.by_frames[frames] / edges.by_frames[shifts] - 1:.0%}",
             "best fit at its own time",
-            "color and depth are of different times: `duagc run --calibrate` estimates the delay",
+            "color and depth are of different times: `duagc run --calibrate` estimates the delay; "
+            "what a run finds with certainty, it takes out by itself",
             confidence=_agreeing(edges.frames_of, frames, shifts),
         )
     elif edges.by_pixels[pixels] > config.clear_ratio * edges.by_pixels[reach] and abs(pixels - reach) > 2:
