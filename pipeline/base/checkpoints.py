@@ -24,6 +24,9 @@ from duagc.pipeline.base.saved_state import DamagedStateError, StateFile, write_
 EVERY_S = 5.0
 LARGEST_SHARE = 0.02
 """Of the time that checkpoints may take; where one takes so long, the next one comes later."""
+LONGEST_S, LARGEST_SHARE_THEN = 8.0, 0.1
+"""Checkpoints come after at most this time all the same, unless they would take more than this share of it: a process
+that is killed loses no more than ten seconds where a checkpoint takes less than one."""
 WORTH_S = 1.0
 """A part that took less is computed again rather than saved."""
 Shown = Callable[[], Any]
@@ -168,8 +171,9 @@ class Checkpoints:
             shown: gives what can be shown of it.
         """
         self.tell(name, done, total, shown)
-        since_s = time.perf_counter() - self._saved_s
-        if since_s >= max(self._every_s, self._last_cost_s / self._largest_share):
+        cost_s = self._last_cost_s
+        due_s = min(cost_s / self._largest_share, max(LONGEST_S, cost_s / LARGEST_SHARE_THEN))
+        if time.perf_counter() - self._saved_s >= max(self._every_s, due_s):
             self._write(f"{name}.state", (state(), done, total))
 
     def done(self, name: str, compute: Callable[[], Value]) -> Value:
