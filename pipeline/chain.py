@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 from duagc.pipeline import steps
 from duagc.pipeline.cache.carrier import Carried, Carrier
@@ -58,7 +58,7 @@ class Chain:
 
         return carrier.carry(stages.CALIBRATION, None, self._recorded(), calibrate)
 
-    def robot(self, robot: str, *, threads: int, alone: bool = False) -> dict[str, Prepared]:
+    def robot(self, robot: str, *, threads: SupportsIndex, alone: bool = False) -> dict[str, Prepared]:
         """Front end and Fisher information of one robot, from its own log alone; by name of the component.
 
         Args:
@@ -94,7 +94,7 @@ class Chain:
             return {name: Prepared(front, None) for name in names}
         return {name: Prepared(front, self._information(name, front, digest, threads)) for name in names}
 
-    def _information(self, name: str, front: Carried, log_digest: str, threads: int) -> Carried:
+    def _information(self, name: str, front: Carried, log_digest: str, threads: SupportsIndex) -> Carried:
         log, carrier = self._recording.log(name), self._carrier
         folder = carrier.folder / "robots" / name
 
@@ -129,7 +129,7 @@ class Chain:
             inputs |= {f"{part} of {name}": digest for part, digest in _own(name, robot).items()}
         return carrier.carry(stages.EXCHANGE, None, inputs, meet)
 
-    def fusion(self, name: str, robot: Prepared, exchange: Carried, *, threads: int) -> Carried:
+    def fusion(self, name: str, robot: Prepared, exchange: Carried, *, threads: SupportsIndex) -> Carried:
         """The fused map of one robot.
 
         Args:

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from duagc import __version__
 from duagc.pipeline import steps
 from duagc.pipeline.base.component_names import robot_of
+from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Step
 from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError
 from duagc.pipeline.cache.file_digests import FileDigests
@@ -28,7 +29,6 @@ from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
 from duagc.pipeline.runs.folder import SCHEMA
-from duagc.pipeline.steps import threads_per_worker
 from duagc.pipeline.time_left import EVERY_S, TimeLeft
 from duagc.pipeline.watch import Watch, ticking
 

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from duagc.pipeline import steps, watch
+from duagc.pipeline import watch
 from duagc.pipeline.base import worker_reports
 from duagc.pipeline.base.machine import memory_bytes
+from duagc.pipeline.base.thread_share import SharedThreads, ThreadShare, keep_share
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.cache.carrier import Carried, Carrier
 from duagc.pipeline.cache.file_digests import FileDigests
@@ -140,28 +141,28 @@ class RobotProcesses:
             alone: leave the information out.
             hear: gets steps of front ends, in another thread.
         """
-        threads = steps.threads_per_worker(workers)
-        found: dict[str, Prepared] = {}
+        found, share = dict[str, Prepared](), ThreadShare(workers, len(robots))
         with (
             worker_reports.listening(hear) as queue,
-            worker_pool(workers, worker_reports.keep_queue, (queue,)) as pool,
+            worker_pool(workers, _keep, (queue, *share.handed)) as pool,
         ):
-            tasks = [pool.submit(self.prepare_one, robot, threads=threads, alone=alone) for robot in robots]
+            tasks = [pool.submit(self.prepare_one, robot, alone=alone) for robot in robots]
+            for task in tasks:
+                task.add_done_callback(share.done)
             for task in tasks:
                 found |= task.result()
         return found
 
-    def prepare_one(self, robot: str, *, threads: int, alone: bool) -> dict[str, Prepared]:
+    def prepare_one(self, robot: str, *, alone: bool) -> dict[str, Prepared]:
         """Front end and information of one robot, in a process of its own.
 
         Args:
             robot: its name.
-            threads: of the kernels; changes no bit.
             alone: leave the information out.
         """
         heard = watch.in_worker(self.where)
         try:
-            return self._chain(heard).robot(robot, threads=threads, alone=alone)
+            return self._chain(heard).robot(robot, threads=SharedThreads(), alone=alone)
         finally:
             heard.tell((robot, "", 0, 0))
             if heard.follower is not None:
@@ -175,24 +176,24 @@ class RobotProcesses:
             exchange: of the team.
             workers: how many at the same time.
         """
-        threads = steps.threads_per_worker(workers)
-        with worker_pool(workers) as pool:
+        share = ThreadShare(workers, len(robots))
+        with worker_pool(workers, keep_share, share.handed) as pool:
             tasks = {
-                name: pool.submit(self.fuse_one, name, robot, exchange, threads=threads)
-                for name, robot in robots.items()
+                name: pool.submit(self.fuse_one, name, robot, exchange) for name, robot in robots.items()
             }
+            for task in tasks.values():
+                task.add_done_callback(share.done)
             return {name: task.result() for name, task in tasks.items()}
 
-    def fuse_one(self, name: str, robot: Prepared, exchange: Carried, *, threads: int) -> Carried:
+    def fuse_one(self, name: str, robot: Prepared, exchange: Carried) -> Carried:
         """The fused map of one robot, in a process of its own.
 
         Args:
             name: of the robot.
             robot: with its own results.
             exchange: of the team.
-            threads: of the kernels; changes no bit.
         """
-        return self._chain(watch.UNWATCHED).fusion(name, robot, exchange, threads=threads)
+        return self._chain(watch.UNWATCHED).fusion(name, robot, exchange, threads=SharedThreads())
 
     def _chain(self, heard: watch.Watch) -> Chain:
         """The stages, in a process that knows nothing of the run yet."""
@@ -203,3 +204,9 @@ class RobotProcesses:
         carrier = carrier_of(self.folder, self.config, self.plan, log=log, place=self.place)
         digests = FileDigests(None) if carrier.store is None else carrier.store.files
         return Chain(Recording(self.recording), carrier, digests, heard)
+
+
+def _keep(queue: Any, busy: Any, in_all: int) -> None:
+    """What a worker process keeps: where it reports its steps, and its share of the threads."""
+    worker_reports.keep_queue(queue)
+    keep_share(busy, in_all)

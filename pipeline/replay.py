@@ -15,6 +15,7 @@ from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
+from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs import stages
@@ -106,7 +107,7 @@ def _replay_one(
     )
     report(f"{robot}: fusion")
     with stages.FUSION.running(folder, robot):
-        steps.fuse_robot(robot, log, folder, result, config=config, threads=steps.threads_per_worker(1))
+        steps.fuse_robot(robot, log, folder, result, config=config, threads=threads_per_worker(1))
     comparisons = [Comparison(robot, "packets sent", sent.recorded, sent.recomputed)]
     for name in ROBOT_RESULTS:
         recorded = digest_file(run / "robots" / robot / name)
@@ -118,7 +119,7 @@ def _prepare(log: Path, robot: str, folder: Path, config: RunConfig) -> None:
     """Front end and information of a robot and its components, each of these in a folder next to the robot's."""
     steps.check_log(log, robot)
     folder.mkdir()
-    threads = steps.threads_per_worker(1)
+    threads = threads_per_worker(1)
     with stages.FRONTEND.running(folder, robot):
         steps.frontend(log, folder, config, threads=threads, checkpoints=Checkpoints())
     for name, of_component in steps.move_components(robot, folder).items():

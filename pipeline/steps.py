@@ -7,12 +7,12 @@ here and all that it imports stay the same. So imports are inside the functions.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsIndex
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.component_names import component_name
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.machine import processors
+from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Hear
 
 if TYPE_CHECKING:
@@ -21,11 +21,6 @@ if TYPE_CHECKING:
     from duagc.pipeline.exchange.session import RoundWatch
     from duagc.pipeline.recording import Recording
     from duagc.pipeline.runs.robot_data import AgentInput, SessionResult
-
-
-def threads_per_worker(workers: int) -> int:
-    """Threads of each of `workers` processes on this machine."""
-    return max(1, processors() // workers)
 
 
 def calibration(recording: Recording, folder: Path, config: RunConfig, *, workers: int) -> dict[str, Any]:
@@ -81,7 +76,7 @@ def check_log(log: Path, robot: str) -> dict[str, int]:
 
 
 def frontend(
-    log: Path, folder: Path, config: RunConfig, *, threads: int, checkpoints: Checkpoints
+    log: Path, folder: Path, config: RunConfig, *, threads: SupportsIndex, checkpoints: Checkpoints
 ) -> dict[str, float]:
     """Track and map one robot.
 
@@ -124,7 +119,7 @@ def move_components(robot: str, folder: Path) -> dict[str, Path]:
     return out
 
 
-def information(log: Path, folder: Path, config: RunConfig, *, threads: int) -> None:
+def information(log: Path, folder: Path, config: RunConfig, *, threads: SupportsIndex) -> None:
     """Fisher information of one robot's map.
 
     Args:
@@ -192,7 +187,13 @@ def exchange(
 
 
 def fusion(
-    robot: str, log: Path, folder: Path, config: RunConfig, *, threads: int, checkpoints: Checkpoints
+    robot: str,
+    log: Path,
+    folder: Path,
+    config: RunConfig,
+    *,
+    threads: SupportsIndex,
+    checkpoints: Checkpoints,
 ) -> dict[str, Any]:
     """Fused map and corrected trajectory of one robot, from what it took home.
 
@@ -221,7 +222,7 @@ def fuse_robot(
     result: SessionResult,
     *,
     config: RunConfig,
-    threads: int,
+    threads: SupportsIndex,
     checkpoints: Checkpoints | None = None,
 ) -> dict[str, str]:
     """Fused map and corrected trajectory of one robot, into the folder of its own results.

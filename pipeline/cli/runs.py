@@ -255,11 +255,11 @@ def evaluate(
 
     Example: `duagc evaluate outputs/demo/run --own-longer`
     """
+    from duagc.pipeline.base.thread_share import threads_per_worker
     from duagc.pipeline.evaluation import evaluate as evaluate_run
     from duagc.pipeline.report.labels import comparison_text
     from duagc.pipeline.runs.folder import RunFolder
     from duagc.pipeline.runs.stages import EVALUATION
-    from duagc.pipeline.steps import threads_per_worker
 
     run = RunFolder(run_folder)
     source, threads = recording or run.recording, threads_per_worker(1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ class GrowingMap:
         guests_begun: centers [m, 3] and radii [m], meters, that the guests had when the tile was taken out.
     """
 
-    def __init__(self, config: MappingConfig, *, threads: int = 1) -> None:
+    def __init__(self, config: MappingConfig, *, threads: SupportsIndex = 1) -> None:
         """Begin with no Gaussian.
 
         Args:

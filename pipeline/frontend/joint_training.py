@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 
@@ -62,7 +62,7 @@ class JointTraining:
         *,
         depth: DepthKind,
         seed: int,
-        threads: int = 1,
+        threads: SupportsIndex = 1,
     ) -> None:
         """Set up.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, SupportsIndex, TypeVar
 
 import numpy as np
 
@@ -55,7 +55,7 @@ class MapBuilder:
         exposures: ExposureTrack,
         noise_m: float | None,
         seed: int,
-        threads: int = 1,
+        threads: SupportsIndex = 1,
         progress: bool = False,
         checkpoints: Checkpoints = NO_CHECKPOINTS,
     ) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ class MapContent:
         config: MappingConfig,
         *,
         depth: DepthKind,
-        threads: int = 1,
+        threads: SupportsIndex = 1,
         begun: GrowingMap | None = None,
     ) -> None:
         """Begin without a view.

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +93,7 @@ class Mapper(MapContent):
         config: MappingConfig,
         seed: int,
         *,
-        threads: int = 1,
+        threads: SupportsIndex = 1,
         depth_noise_m: float | None = None,
         begun: GrowingMap | None = None,
         tile: int = 0,

@@ -9,6 +9,7 @@ What tracking knew is the prior. The frames that made the map stay where its opt
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import SupportsIndex
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class ModelTracker:
         config: ModelConfig,
         *,
         registration: RegistrationConfig,
-        threads: int = 1,
+        threads: SupportsIndex = 1,
     ) -> None:
         """Prepare the map.
 

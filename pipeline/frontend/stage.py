@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import SupportsIndex
 
 import numpy as np
 
@@ -62,7 +63,7 @@ def run_frontend(
     config: FrontendConfig,
     *,
     seed: int = 0,
-    threads: int = 1,
+    threads: SupportsIndex = 1,
     progress: bool = False,
     checkpoints: Checkpoints | None = None,
 ) -> dict[str, float]:
@@ -257,7 +258,7 @@ class _ComponentStage:
     name: str
     config: FrontendConfig
     seed: int
-    threads: int
+    threads: SupportsIndex
     progress: bool
     noise_m: float | None
     clock: LapTimes

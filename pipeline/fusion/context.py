@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import SupportsIndex
 
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
@@ -29,5 +30,5 @@ class MapContext:
     matching: MapMatching
     depth_kind: DepthKind = "blended"
     weights: WeightKind = "block"
-    threads: int = 1
+    threads: SupportsIndex = 1
     seed: int = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,7 @@ def run_fusion(
     moving: MovingConfig,
     weights: WeightKind = "block",
     seed: int = 0,
-    threads: int = 1,
+    threads: SupportsIndex = 1,
     checkpoints: Checkpoints | None = None,
 ) -> tuple[PeerCheck, ...]:
     """Write fused.mcap, fused.ply, refined.ply, trajectory.tum and odometry.tum of one robot.

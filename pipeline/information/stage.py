@@ -7,6 +7,7 @@ information.mcap. Source: method section 1 and 2, paper eq. (2)-(4) with J^T R^-
 from __future__ import annotations
 
 from pathlib import Path
+from typing import SupportsIndex
 
 import numpy as np
 
@@ -33,7 +34,7 @@ def run_information(
     config: InformationConfig,
     moving: MovingConfig,
     thickness_floor_m: float,
-    threads: int = 1,
+    threads: SupportsIndex = 1,
 ) -> GaussianInformation:
     """Write the Fisher information of a robot's final map, from its own keyframes.
 

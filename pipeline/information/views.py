@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ class MapViews:
     camera: PinholeCamera
     images: Sequence[PosedRgbd]
     depth_kind: DepthKind = "blended"
-    threads: int = 1
+    threads: SupportsIndex = 1
 
     def rasterizer(self) -> Rasterizer:
         """A rasterizer with these threads."""

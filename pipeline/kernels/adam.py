@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import operator
+from typing import SupportsIndex
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +20,7 @@ _CONSTANTS = np.array([BETA_1, 1 - BETA_1, BETA_2, 1 - BETA_2, EPSILON], np.floa
 class CompiledAdam(Adam):
     """`splat.optimizer.Adam` on all cores asked for; the same bits as that, for any number of threads."""
 
-    def __init__(self, n: int = 0, isa: str = "auto", threads: int = 1) -> None:
+    def __init__(self, n: int = 0, isa: str = "auto", threads: SupportsIndex = 1) -> None:
         super().__init__(n)
         self.isa, self.threads = isa, threads
 
@@ -40,7 +43,7 @@ class CompiledAdam(Adam):
         step_lengths = np.array([getattr(rates, name) for name in names], np.float32)
         touched_by = (gradients.colors, gradients.opacity_logits)
         state = (self._steps, self._corrections)
-        arguments = (*arrays, step_lengths, _CONSTANTS, *touched_by, *state, self.threads)
+        arguments = (*arrays, step_lengths, _CONSTANTS, *touched_by, *state, operator.index(self.threads))
         _raster.adam(self.isa, *arguments)
         return gaussians.replace(**dict(zip(names, out, strict=True)))
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import astuple
 from numbers import Real
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,7 +67,7 @@ class Rasterizer:
     is released. All results are the same bits for any number of threads and on every instruction set.
     """
 
-    def __init__(self, isa: str = "auto", threads: int = 1) -> None:
+    def __init__(self, isa: str = "auto", threads: SupportsIndex = 1) -> None:
         """Choose how to compute.
 
         Args:
@@ -77,9 +78,9 @@ class Rasterizer:
         """
         if not isinstance(isa, str) or isa not in ("auto", *available_isas()):
             raise ValueError(f"isa is {isa!r}, available here: auto, {', '.join(available_isas())}")
-        if not isinstance(threads, (int, np.integer)) or not 1 <= threads <= MAX_THREADS:
+        if not isinstance(threads, SupportsIndex) or not 1 <= operator.index(threads) <= MAX_THREADS:
             raise ValueError(f"threads is {threads!r}, expected a whole number from 1 to {MAX_THREADS}")
-        self.threads = int(threads)
+        self.threads = threads
         self._raster = _raster.Raster(isa)
         self._gaussians: Gaussians | None = None
         self._closed_early = False
@@ -230,7 +231,11 @@ class Rasterizer:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         wanted = _NO_MASK if mask is None else checked_mask(mask, (height, width))
         ray_plane = depth_kind == "ray_plane"
-        return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, self.threads)
+        return (
+            height,
+            width,
+            (pose, intrinsics, behind, wanted, ray_plane, width, height, operator.index(self.threads)),
+        )
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
         """Remember what was drawn, or refuse what could not be."""

@@ -85,6 +85,19 @@ def test_one_digest_for_threads_and_instruction_sets(isa, threads):
 
 
 @pytest.mark.slow
+def test_one_digest_while_the_number_of_threads_changes():
+    class Changing:
+        calls = 0
+
+        def __index__(self) -> int:
+            self.calls += 1
+            return 1 + self.calls % 4
+
+    threads = Changing()
+    assert digest(Rasterizer(threads=threads)) == one_digest()
+    assert threads.calls >= 3
+
+
 @pytest.mark.parametrize(("isa", "threads"), CALLS)
 def test_one_digest_of_many_gaussians(isa, threads):
     assert digest(Rasterizer(isa, threads), MANY) == one_digest(MANY)
