@@ -33,7 +33,7 @@ BUDGET_S = {
     "examples": 15,
     "exchange": 36,
     "experiments": 3,
-    "frontend": 64,
+    "frontend": 72,
     "fusion": 2,
     "fuzz": 10,
     "geometry": 1,

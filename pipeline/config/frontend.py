@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.exposure import ExposureConfig
 from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.other_trackers import Open3dTrackerConfig, RenderingTrackerConfig
 from duagc.pipeline.config.registration import GeometricVerificationConfig, MovingConfig, RegistrationConfig
 
 # Not settings: the files of a run and their readers promise this rule.
@@ -248,6 +251,11 @@ class RelocalizationConfig(GeometricVerificationConfig):
 class TrackingConfig(Config):
     """Tracking of frames against the latest keyframe."""
 
+    method: Literal["registration", "rendering", "open3d"] = "registration"
+    """How poses are found: by registration, which all settings but the two sections below are of, or, to compare with,
+    by gradient steps on a rendered map, or by Open3D's dense SLAM. The latter two lose and relocalize nothing."""
+    rendering: RenderingTrackerConfig = RenderingTrackerConfig()
+    open3d: Open3dTrackerConfig = Open3dTrackerConfig()
     registration: RegistrationConfig = RegistrationConfig()
     """The usual registration, from the motion of the two frames before."""
     recovery: RegistrationConfig = RegistrationConfig(

@@ -81,12 +81,26 @@ def becomes_keyframe(result: Registration, pyramid: RgbdPyramid, config: Keyfram
         pyramid: of the frame.
         config: the limits.
     """
-    if min(result.overlap, result.view) < config.min_overlap:
+    return leaves_keyframe(min(result.overlap, result.view), result.T_reference_target, pyramid, config)
+
+
+def leaves_keyframe(
+    overlap: float, T_keyframe_camera: Array, pyramid: RgbdPyramid, config: KeyframeConfig
+) -> bool:
+    """Whether a view shares too little with its keyframe, or moved or turned too far from it.
+
+    Args:
+        overlap: share of the keyframe that it sees.
+        T_keyframe_camera: [4, 4].
+        pyramid: of the view.
+        config: the limits.
+    """
+    if overlap < config.min_overlap:
         return True
     coarsest = pyramid.levels[-1].inverse_depth
     known = coarsest[coarsest > 0]
     median_depth_m = 1 / float(np.median(known)) if len(known) else np.inf
-    moved_m, turned_rad = se3.distance(np.eye(4), result.T_reference_target)
+    moved_m, turned_rad = se3.distance(np.eye(4), T_keyframe_camera)
     return bool(
         moved_m > config.max_translation_of_depth * median_depth_m or turned_rad > config.max_rotation_rad
     )

@@ -94,7 +94,7 @@ class View:
             color=color,
             depth_m=depth_m,
             half_color=halve(unit_color(color, exposure)),
-            half_depth_m=_halve_depth(depth_m),
+            half_depth_m=halve_depth(depth_m),
             T_map_camera=np.array(T_map_camera, dtype=np.float64),
             median_depth_m=float(np.median(near[near > 0])) if near.any() else 0.0,
             mask=mask,
@@ -168,8 +168,12 @@ def view_overlap(view: View, other: View, camera: PinholeCamera, stride_px: int 
     return projection.overlap(seen, camera, depth_m=other.depth_m)
 
 
-def _halve_depth(depth_m: Image) -> Image:
-    """Means of 2x2 blocks of measured depths on one surface (within 2 %); 0 where a pixel is missing or differs."""
+def halve_depth(depth_m: Image) -> Image:
+    """Means of 2x2 blocks of measured depths on one surface (within 2 %); 0 where a pixel is missing or differs.
+
+    Args:
+        depth_m: [H, W], 0 = unknown.
+    """
     h, w = depth_m.shape[0] // 2 * 2, depth_m.shape[1] // 2 * 2
     quarters = np.stack([depth_m[i:h:2, j:w:2] for i in (0, 1) for j in (0, 1)])
     nearest, farthest = quarters.min(axis=0), quarters.max(axis=0)

@@ -31,6 +31,7 @@ from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector,
 from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
 from duagc.pipeline.frontend.kept_pyramids import KeptPyramids
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
+from duagc.pipeline.frontend.other_tracker import OtherTracker
 from duagc.pipeline.frontend.output import (
     BuiltMap,
     Maps,
@@ -96,7 +97,7 @@ def run_frontend(
         )
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
-        tracked = _Tracking(log, config, motion, progress, save).run()
+        tracked = _Tracking(log, config, motion, seed, threads, progress, save).run()
         if not tracked.submaps[0].keyframes:
             reasons = ", ".join(sorted({frame.reason.value for frame in tracked.frames}))
             size = f"{log.camera.width} x {log.camera.height}"
@@ -163,6 +164,8 @@ class _Tracking:
     log: RgbdLog
     config: FrontendConfig
     motion: MotionPrior | None
+    seed: int
+    threads: int
     progress: bool
     checkpoints: Checkpoints
 
@@ -181,7 +184,7 @@ class _Tracking:
         return tracked
 
     def _leading(self, tracked: TrackedLog) -> TrackedLog:
-        if not tracked.submaps[0].keyframes:
+        if not tracked.submaps[0].keyframes or self.config.tracking.method != "registration":
             return tracked
         return track_leading_frames(self.log, tracked, self.config)
 
@@ -198,7 +201,7 @@ class _Tracking:
 
     def _frames(self, part: str) -> TrackedLog:
         log, save = self.log, self.checkpoints
-        tracker = SubmapTracker(log.camera, self.config, self.motion)
+        tracker = self._tracker()
         begin = 0
         if (saved := save.resume(part)) is not None:
             begin, state = saved
@@ -210,6 +213,19 @@ class _Tracking:
             tracker.track(RgbdImages.of(log.frame(index)))
             save.at(part, index + 1, len(log), tracker.state, shown=tracker.path)
         return tracker.finish()
+
+    def _tracker(self) -> SubmapTracker | OtherTracker:
+        """As the configuration asks for; others than the usual one are imported by need."""
+        camera, config = self.log.camera, self.config
+        if config.tracking.method == "rendering":
+            from duagc.pipeline.frontend.rendering_tracker import RenderingTracker
+
+            return RenderingTracker(camera, config, self.log.frame, seed=self.seed, threads=self.threads)
+        if config.tracking.method == "open3d":
+            from duagc.pipeline.frontend.open3d_tracker import Open3dTracker
+
+            return Open3dTracker(camera, config, self.log.frame)
+        return SubmapTracker(camera, config, self.motion)
 
 
 def _trajectories(tracked: TrackedLog) -> list[Trajectory]:
