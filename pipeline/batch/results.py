@@ -60,11 +60,21 @@ def numbers_of(run: Path) -> dict[str, float | str | None]:
         out[name] = value if value is None or isinstance(value, str) else float(value)  # type: ignore[arg-type]
     path = run / "timing.json"
     if path.is_file():
-        rows = json.loads(read_text(path, "times of a run"))["stages"].values()
+        rows = list(json.loads(read_text(path, "times of a run"))["stages"].values())
         for name in ("wall_s", "cpu_s"):
             out[f"time.{name}"] = round(math.fsum(row[name] for row in rows), 3)
         out["time.peak_rss_mb"] = max(row["peak_rss_mb"] for row in rows)
+        frames = [v for k, v in out.items() if k.startswith("robots.") and k.endswith(".frames")]
+        known = [value for value in frames if isinstance(value, float) and value > 0]
+        if known and any("parts" in row for row in rows):
+            out["time.tracking_ms_per_frame"] = round(1e3 * _tracking_s(rows) / math.fsum(known), 3)
     return out
+
+
+def _tracking_s(rows: Sequence[Mapping[str, Any]]) -> float:
+    """Processor time of tracking, of the front ends: parts are wall times, which share that of their stage."""
+    parts = [(row["cpu_s"], row["parts"]) for row in rows if "parts" in row]
+    return math.fsum(cpu_s * of["tracking_s"] / max(math.fsum(of.values()), 1e-9) for cpu_s, of in parts)
 
 
 def gather(suite: Suite, out: Path) -> dict[str, dict[str, float | str | None]]:

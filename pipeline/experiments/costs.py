@@ -27,9 +27,9 @@ Made by `duagc experiment report DIR` of the [experiments](experiments.md).
 Means over the runs of each configuration; robots share a machine.
 Times are those of the stages when they were computed, memory is that of the largest process.
 
-| experiment | configuration | runs | robots | processor time (s a robot) | memory (MB) | sent (MB a robot) | rounds | \
-Gaussians of a fused map |
-| --- | --- | --- | --- | --- | --- | --- | --- | --- |
+| experiment | configuration | runs | robots | processor time (s a robot) | of it tracking (ms a frame) | \
+memory (MB) | sent (MB a robot) | rounds | Gaussians of a fused map |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 """
 
 
@@ -43,6 +43,7 @@ class Cost:
         runs: that are done.
         robots: of a run.
         cpu_s: of all stages, of each robot.
+        tracking_ms: processor time of a frame in tracking.
         memory_mb: of the largest process.
         sent_bytes: by each robot.
         rounds: of the session.
@@ -54,6 +55,7 @@ class Cost:
     runs: int
     robots: float
     cpu_s: float
+    tracking_ms: float
     memory_mb: float
     sent_bytes: float
     rounds: float
@@ -108,6 +110,7 @@ def _cost(experiment: str, configuration: str, runs: int, numbers: dict[str, lis
         runs=runs,
         robots=robots,
         cpu_s=of("time.cpu_s") / robots,
+        tracking_ms=of("time.tracking_ms_per_frame"),
         memory_mb=of("time.peak_rss_mb"),
         sent_bytes=of("exchange.bytes_sent") / robots,
         rounds=of("exchange.rounds"),
@@ -120,6 +123,7 @@ def _cells(cost: Cost) -> Iterator[str]:
     shown = (
         (cost.robots, 0),
         (cost.cpu_s, 1),
+        (cost.tracking_ms, 1),
         (cost.memory_mb, 0),
         (cost.sent_bytes / 1e6, 3),
         (cost.rounds, 1),
