@@ -7,12 +7,17 @@ from dataclasses import dataclass
 
 from duagc.pipeline.cache import durations
 from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.frontend import TrackingConfig
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.experiments.rule import Experiment, SimulatedData, config_of, data_of
 
 FRAMES_PER_KEYFRAME = 14
 """About as many as simulated robots have."""
+PIXEL_STEPS_PER_S = 1e7
+"""Pixels that tracking by rendering looks at in a second."""
+OPEN3D_FRAMES_PER_S = 10
+"""Of Open3D's dense SLAM, with voxels of 2 cm."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +64,20 @@ def _times(data: SimulatedData, config: RunConfig) -> tuple[float, float]:
     keyframes = 1 + data.frames // FRAMES_PER_KEYFRAME
     size = {"frames": data.frames, "pixels": data.width * data.height, "keyframes": keyframes}
     front_s = durations.front_end_s(size, config.frontend.mapping) + durations.information_s(size)
+    front_s += _other_tracker_s(size, config.frontend.tracking)
     rest_s = durations.exchange_s([size] * data.robots)
     rest_s += data.robots * (_fusion_s(size, config) + durations.evaluation_s(size, data.robots))
     return data.robots * front_s, rest_s
+
+
+def _other_tracker_s(size: durations.Size, config: TrackingConfig) -> float:
+    """What a tracker to compare with takes besides."""
+    if config.method == "rendering":
+        pixels = size["pixels"]
+        while pixels > config.rendering.max_pixels:
+            pixels //= 4
+        return size["frames"] * (config.rendering.steps + 1) * pixels / PIXEL_STEPS_PER_S
+    return size["frames"] / OPEN3D_FRAMES_PER_S if config.method == "open3d" else 0.0
 
 
 def _fusion_s(size: durations.Size, config: RunConfig) -> float:

@@ -168,6 +168,17 @@ def test_a_front_end_counts_once_for_all_that_comes_after_it(folder: Path) -> No
     assert predicted_time([read_experiment("own", folder)], "small").cpu_s > 1.1 * alone
 
 
+def test_trackers_to_compare_with_take_longer(folder: Path) -> None:
+    text, found = FILE.replace("frames = 2", "frames = 100"), {}
+    for method in ("registration", "open3d", "rendering"):
+        setting = f"frontend.tracking.method={method}"
+        (folder / f"{method}.toml").write_text(text.replace("exchange.link.loss_probability=0.3", setting))
+        found[method] = predicted_time([read_experiment(method, folder)], "small").cpu_s
+    ten_robots = 10  # two of each of five recordings
+    assert found["open3d"] > found["registration"] + ten_robots * 5
+    assert found["rendering"] > found["registration"] + ten_robots * 5
+
+
 def test_a_recording_without_truth_is_refused_before_anything_runs(tmp_path: Path) -> None:
     fake = fake_run.make(tmp_path / "fake")
     for path in fake.recording.rglob("*groundtruth*"):
