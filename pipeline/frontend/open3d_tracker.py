@@ -58,10 +58,10 @@ class Open3dTracker(OtherTracker):
             ("tsdf", "weight", "color"),
             (core.float32, core.float32, core.float32),
             ((1), (1), (3)),
-            self.settings.voxel_m,
-            BLOCK_VOXELS,
-            self.settings.blocks,
-            core.Device("CPU:0"),
+            voxel_size=self.settings.voxel_m,
+            block_resolution=BLOCK_VOXELS,
+            block_count=self.settings.blocks,
+            device=core.Device("CPU:0"),
         )
         self._intrinsics = self._tensor(camera.matrix())
         self._method = {
@@ -88,11 +88,11 @@ class Open3dTracker(OtherTracker):
                 self._drawn(seen, T_map_predicted),
                 self._intrinsics,
                 self._tensor(np.eye(4)),
-                METERS,
-                settings.max_depth_m,
-                self._criteria,
-                self._method,
-                odometry.OdometryLossParams(settings.max_distance_m),
+                depth_scale=METERS,
+                depth_max=settings.max_depth_m,
+                criteria_list=self._criteria,
+                method=self._method,
+                params=odometry.OdometryLossParams(settings.max_distance_m),
             )
         except RuntimeError:  # a singular system: nothing corresponds, or only one plane does
             return Reason.ILL_CONDITIONED
@@ -124,9 +124,9 @@ class Open3dTracker(OtherTracker):
             seen.color,
             self._intrinsics,
             self._extrinsics(T_map_camera),
-            METERS,
-            settings.max_depth_m,
-            settings.truncation_voxels,
+            depth_scale=METERS,
+            depth_max=settings.max_depth_m,
+            trunc_voxel_multiplier=settings.truncation_voxels,
         )
 
     def map_state(self) -> Any:
@@ -148,7 +148,13 @@ class Open3dTracker(OtherTracker):
         plane, normals = core.Tensor.ones((8, 8, 3), core.float32), core.Tensor.ones((8, 8, 3), core.float32)
         with suppress(RuntimeError):  # one plane determines nothing
             odometry.compute_odometry_result_point_to_plane(
-                plane, plane, normals, self._tensor(self.camera.matrix()), self._tensor(np.eye(4)), 1.0, 1.0
+                plane,
+                plane,
+                normals,
+                self._tensor(self.camera.matrix()),
+                self._tensor(np.eye(4)),
+                depth_outlier_trunc=1.0,
+                depth_huber_delta=1.0,
             )
 
     def _drawn(self, seen: Any, T_map_camera: Array) -> Any:
@@ -161,13 +167,13 @@ class Open3dTracker(OtherTracker):
             self._extrinsics(T_map_camera),
             camera.width,
             camera.height,
-            ["depth", "color"],
-            METERS,
-            settings.min_depth_m,
-            settings.max_depth_m,
-            float(least),
-            settings.truncation_voxels,
-            max(1, camera.width // RANGE_MAP_WIDTH),
+            render_attributes=["depth", "color"],
+            depth_scale=METERS,
+            depth_min=settings.min_depth_m,
+            depth_max=settings.max_depth_m,
+            weight_threshold=float(least),
+            trunc_voxel_multiplier=settings.truncation_voxels,
+            range_map_down_factor=max(1, camera.width // RANGE_MAP_WIDTH),
         )
         image = self._o3d.t.geometry.Image
         return self._o3d.t.geometry.RGBDImage(image(drawn["color"]), image(drawn["depth"]))

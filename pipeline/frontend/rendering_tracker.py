@@ -111,6 +111,7 @@ class PoseFit:
         depth: DepthKind,
         images: FitImages,
         T_map_camera: Array,
+        *,
         exposure: tuple[float, float],
     ) -> Fit | None:
         """The pose of the least loss on the way; None if the map is opaque in too few pixels at the start.
@@ -234,7 +235,7 @@ class RenderingTracker(OtherTracker):
         if images.mask is not None and not images.mask.any():
             return Reason.NO_PIXEL
         small, gaussians, depth = self._small(images), self._mapper.gaussians, self._mapper.depth
-        fit = self._fit.run(gaussians, depth, small, T_map_predicted, self._exposure)
+        fit = self._fit.run(gaussians, depth, small, T_map_predicted, exposure=self._exposure)
         if fit is None:
             return Reason.LOW_OVERLAP
         self._exposure = fit.exposure

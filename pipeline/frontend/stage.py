@@ -97,7 +97,7 @@ def run_frontend(
         )
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
-        tracked = _Tracking(log, config, motion, seed, threads, progress, save).run()
+        tracked = _Tracking(log, config, motion, save, seed=seed, threads=threads, progress=progress).run()
         if not tracked.submaps[0].keyframes:
             reasons = ", ".join(sorted({frame.reason.value for frame in tracked.frames}))
             size = f"{log.camera.width} x {log.camera.height}"
@@ -164,10 +164,10 @@ class _Tracking:
     log: RgbdLog
     config: FrontendConfig
     motion: MotionPrior | None
+    checkpoints: Checkpoints
     seed: int
     threads: int
     progress: bool
-    checkpoints: Checkpoints
 
     def run(self) -> TrackedLog:
         """Track; where color and depth are of different times, again with depth moved by the first result."""
