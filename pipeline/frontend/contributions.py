@@ -12,7 +12,7 @@ from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.mapping_views import View
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels import FisherSums, Rasterizer
+from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 
 
@@ -41,7 +41,7 @@ def contributions(
     Returns:
         [n] both.
     """
-    sums = FisherSums(len(gaussians))
+    information, observations = np.zeros(len(gaussians)), np.zeros(len(gaussians), np.uint32)
     inverse_color = np.full((camera.height, camera.width), config.contribution_color_sigma**-2, np.float32)
     for view in views:
         rasterizer.forward(
@@ -50,6 +50,6 @@ def contributions(
         inverse_depth = (view.half_depth_m > 0) * np.float32(config.contribution_depth_sigma_m**-2)
         if view.half_certainty is not None:
             inverse_depth = inverse_depth * view.half_certainty**2
-        rasterizer.fisher(inverse_color, inverse_depth, sums)
+        rasterizer.opacity_information(inverse_color, inverse_depth, information, observations)
     transparency = 1.0 / (1.0 + np.exp(gaussians.opacity_logits.astype(np.float64)))
-    return sums.opacity / transparency**2, sums.observations > 0
+    return information / transparency**2, observations > 0

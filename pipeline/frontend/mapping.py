@@ -36,7 +36,6 @@ from duagc.pipeline.kernels import (
     CompiledAdam,
     Gradients,
     LossWeights,
-    ViewLoss,
 )
 from duagc.pipeline.kernels.sparse_steps import EVERYTHING, LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import TrainingStep
@@ -316,10 +315,7 @@ class Mapper(MapContent):
     # --- one view -----------------------------------------------------------------------------------------------
 
     def _loss(self, view: View, level: int) -> float:
-        return self._view_gradients(view, level)[0].value
-
-    def _view_gradients(self, view: View, level: int) -> tuple[ViewLoss, Gradients]:
-        return self._step.gradients(self._seen(view), self.cameras[level], view.training(level))
+        return self._step.loss_of(self._seen(view), self.cameras[level], view.training(level)).value
 
     def _mean_loss(self) -> float:
         return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0

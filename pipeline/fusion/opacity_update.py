@@ -22,7 +22,7 @@ from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.fuse import FusedMap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.kernels import FisherSums, Rasterizer
+from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.kernels.training import LARGEST_LOGIT
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import OPACITY, OPACITY_INFORMATION
@@ -97,20 +97,19 @@ class _OwnPixels:
         """Slope and information of the opacity logits [n] of a map, whose other parameters never change."""
         slope, information = np.zeros(len(gaussians)), np.zeros(len(gaussians))
         if len(self._views) <= self._context.config.finetune.keyframes:
-            sums = FisherSums(len(gaussians))
             for view in self._views:
-                slope += self._of_view(view, gaussians, sums)
-            return slope, sums.opacity
+                slope += self._of_view(view, gaussians, information)
+            return slope, information
         self._cells = self._cells or MapCells.of(gaussians)
         for view in self._views:
             rows = self._cells.seen(view.depth_m, view.T_world_camera, self._context.camera)
-            sums = FisherSums(len(rows))
-            slope[rows] += self._of_view(view, gaussians.select(rows), sums)
-            information[rows] += sums.opacity
+            of_view = np.zeros(len(rows))
+            slope[rows] += self._of_view(view, gaussians.select(rows), of_view)
+            information[rows] += of_view
         return slope, information
 
-    def _of_view(self, view: PosedRgbd, gaussians: Gaussians, sums: FisherSums) -> NDArray[np.float32]:
-        """The slope by a view; its information is added to the sums."""
+    def _of_view(self, view: PosedRgbd, gaussians: Gaussians, information: Array) -> NDArray[np.float32]:
+        """The slope by a view; its information is added."""
         render = self._rasterizer.forward(
             gaussians,
             self._context.camera,
@@ -122,5 +121,6 @@ class _OwnPixels:
         if view.mask is not None:
             off[~view.mask] = 0.0
         slope = self._rasterizer.backward(off * self._precision).opacity_logits
-        self._rasterizer.fisher(self._everywhere, self._nowhere, sums)
+        observations = np.zeros(len(gaussians), np.uint32)
+        self._rasterizer.opacity_information(self._everywhere, self._nowhere, information, observations)
         return slope

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels.types import FISHER_DIAGONAL_COLUMNS, FisherSums
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import GEOMETRY_SIZE
 
 Image = NDArray[np.float32]
 MAX_SIDE_PX = 16384
@@ -150,6 +152,29 @@ def check_array(name: str, array: object, shape: tuple[int, ...], dtype: type) -
         raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
     if not array.flags.c_contiguous or not array.flags.writeable:
         raise ValueError(f"{name} is not a contiguous, writeable array")
+
+
+def check_sums(sums: object, n: int) -> None:
+    """Refuse sums that are not of n Gaussians.
+
+    Args:
+        sums: the argument.
+        n: number of Gaussians.
+    """
+    check_type("sums", sums, FisherSums)
+    assert isinstance(sums, FisherSums)  # for mypy
+    expected: dict[str, tuple[tuple[int, ...], type]] = {
+        "geometry": ((n, GEOMETRY_SIZE), np.float64),
+        "color": ((n, 3), np.float64),
+        "opacity": ((n,), np.float64),
+        "weight": ((n,), np.float64),
+        "residual": ((n,), np.float64),
+        "observations": ((n,), np.uint32),
+    }
+    if sums.diagonal is not None:
+        expected["diagonal"] = ((n, FISHER_DIAGONAL_COLUMNS), np.float64)
+    for name, (shape, dtype) in expected.items():
+        check_array(f"sums.{name}", getattr(sums, name), shape, dtype)
 
 
 def checked_image(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.kernels import _raster
 from duagc.pipeline.kernels.arguments import arrays_of
-from duagc.pipeline.kernels.types import Gradients
+from duagc.pipeline.kernels.types import Gradients, LossWeights, ViewLoss
 from duagc.pipeline.splat.gaussians import Gaussians
 
 NOTHING = np.zeros(0, dtype=np.float32)  # an optional array that is not given
@@ -48,3 +48,20 @@ def gradients_of(
     names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
     arrays: dict[str, Any] = dict(zip(names, of_parameters or nothing, strict=True))
     return Gradients(**arrays, pose=pose, fisher_diagonal=fisher_diagonal)
+
+
+def view_loss(values: NDArray[np.float64], weights: LossWeights) -> ViewLoss:
+    """The loss of a view from its terms.
+
+    Args:
+        values: [6] of color, depth, missing alpha, by ln gain, by offset, of surface.
+        weights: of the terms.
+    """
+    of_color, of_depth, missing, by_gain, by_offset, surface = (float(value) for value in values)
+    value = (
+        of_color
+        + weights.depth_weight * of_depth
+        + weights.alpha_weight * missing
+        + weights.surface_weight * surface
+    )
+    return ViewLoss(value, of_color, of_depth, (by_gain, by_offset), surface)

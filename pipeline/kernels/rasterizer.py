@@ -21,6 +21,7 @@ from duagc.pipeline.kernels.arguments import (
     arrays_of,
     check_array,
     check_share,
+    check_sums,
     check_type,
     check_wanted,
     checked_background,
@@ -33,7 +34,7 @@ from duagc.pipeline.kernels.arguments import (
     refuse_bad_image,
 )
 from duagc.pipeline.kernels.definition import TRANSMITTANCE_MIN
-from duagc.pipeline.kernels.outputs import NOTHING, empty, gradients_of, outputs_for, zeros
+from duagc.pipeline.kernels.outputs import NOTHING, empty, gradients_of, outputs_for, view_loss, zeros
 from duagc.pipeline.kernels.types import (
     FISHER_DIAGONAL_COLUMNS,
     FisherSums,
@@ -44,7 +45,6 @@ from duagc.pipeline.kernels.types import (
     ViewLoss,
 )
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
-from duagc.pipeline.splat.information import GEOMETRY_SIZE
 
 MAX_THREADS = 1024
 MAX_GAUSSIANS = 2**30
@@ -166,7 +166,7 @@ class Rasterizer:
             mask: as in `forward`.
             depth_kind: as in `forward`.
             pose: also differentiate by the right tangent of T_map_camera.
-            parameters: False takes the derivative of the pose alone, which is cheaper.
+            parameters: False takes the derivative of the pose alone, which is cheaper, or none at all.
             depth_certainty: factor [H, W] of the depth residuals, 0..1; None: all 1.
             closing: the Gaussian that takes the light of a pixel below this stops all that is left: about the same
                 image from fewer Gaussians. At most `TRANSMITTANCE_MIN`: as `forward` draws.
@@ -187,7 +187,6 @@ class Rasterizer:
         *of_images, surface_weight = astuple(loss)
         check_share("closing", closing)
         weights = np.array([*of_images, *gain_and_offset, surface_weight, closing], np.float32)
-        check_wanted(pose, parameters, fisher=False)
         out = outputs_for(gaussians, parameters)
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
         arguments = [*arrays_of(gaussians), *view, *measured, weights, values, *out, by_pose]
@@ -198,17 +197,7 @@ class Rasterizer:
         refuse_bad_image(status, {"color": NOT_FINITE, "depth_m": NEGATIVE, "depth_certainty": NEGATIVE})
         self._finish(gaussians, (height, width), status)
         self._closed_early = closing > TRANSMITTANCE_MIN
-        of_color, of_depth, missing, by_gain, by_offset, surface = (float(value) for value in values)
-        value = (
-            of_color
-            + loss.depth_weight * of_depth
-            + loss.alpha_weight * missing
-            + loss.surface_weight * surface
-        )
-        return (
-            ViewLoss(value, of_color, of_depth, (by_gain, by_offset), surface),
-            gradients_of(out if parameters else None, by_pose if pose else None),
-        )
+        return view_loss(values, loss), gradients_of(out if parameters else None, by_pose if pose else None)
 
     def _view(
         self,
@@ -305,25 +294,12 @@ class Rasterizer:
             ValueError: an argument of a wrong type, shape or value; the message names it.
         """
         gaussians, size = self._last_forward()
-        n = len(gaussians)
         images = (
             checked_image("inv_var_color", inv_var_color, size),
             checked_image("inv_var_depth", inv_var_depth, size),
             NOTHING if residual is None else checked_image("residual", residual, size),
         )
-        check_type("sums", sums, FisherSums)
-        expected = {
-            "geometry": ((n, GEOMETRY_SIZE), np.float64),
-            "color": ((n, 3), np.float64),
-            "opacity": ((n,), np.float64),
-            "weight": ((n,), np.float64),
-            "residual": ((n,), np.float64),
-            "observations": ((n,), np.uint32),
-        }
-        if sums.diagonal is not None:
-            expected["diagonal"] = ((n, FISHER_DIAGONAL_COLUMNS), np.float64)
-        for name, (shape, dtype) in expected.items():
-            check_array(f"sums.{name}", getattr(sums, name), shape, dtype)
+        check_sums(sums, len(gaussians))
         diagonal = _NO_DOUBLES if sums.diagonal is None else sums.diagonal
         added = (
             sums.geometry,
@@ -336,6 +312,30 @@ class Rasterizer:
         )
         status = self._raster.fisher(*arrays_of(gaussians), *images, *added)
         refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth", "residual"), NEGATIVE))
+
+    def opacity_information(
+        self,
+        inv_var_color: Image,
+        inv_var_depth: Image,
+        information: NDArray[np.float64],
+        observations: NDArray[np.uint32],
+    ) -> None:
+        """What `fisher` adds to `FisherSums.opacity` and `observations`, to the same bits, without the others.
+
+        Args:
+            inv_var_color: as in `fisher`.
+            inv_var_depth: as in `fisher`.
+            information: float64 [n], of the logits; added to.
+            observations: uint32 [n], views in which a pixel of non-zero precision saw the Gaussian; added to.
+        """
+        gaussians, size = self._last_forward()
+        color = checked_image("inv_var_color", inv_var_color, size)
+        depth = checked_image("inv_var_depth", inv_var_depth, size)
+        check_array("information", information, (len(gaussians),), np.float64)
+        check_array("observations", observations, (len(gaussians),), np.uint32)
+        added = information, observations
+        status = self._raster.opacity_information(*arrays_of(gaussians), color, depth, *added)
+        refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth"), NEGATIVE))
 
     def full_fisher(self, inv_var_color: Image, inv_var_depth: Image) -> NDArray[np.float64]:
         """J^T R^-1 J [n, 14, 14] of the last view with all its cross terms; for validation, not for speed.

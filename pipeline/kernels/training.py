@@ -68,6 +68,16 @@ class TrainingStep:
     loss: LossWeights
     depth_kind: DepthKind
 
+    def loss_of(self, gaussians: Gaussians, camera: PinholeCamera, view: TrainingView) -> ViewLoss:
+        """Loss of a view.
+
+        Args:
+            gaussians: as of `gradients`.
+            camera: as of `gradients`.
+            view: as of `gradients`.
+        """
+        return self.gradients(gaussians, camera, view, parameters=False)[0]
+
     def gradients(
         self,
         gaussians: Gaussians,
@@ -76,6 +86,7 @@ class TrainingStep:
         *,
         pose: bool = False,
         closing: float = 0.0,
+        parameters: bool = True,
     ) -> tuple[ViewLoss, Gradients]:
         """Loss of a view and its derivatives by the Gaussians.
 
@@ -85,6 +96,7 @@ class TrainingStep:
             view: an image with its pose.
             pose: also differentiate by the right tangent of the pose.
             closing: as of `Rasterizer.view_gradients`.
+            parameters: as of `Rasterizer.view_gradients`.
         """
         return self.rasterizer.view_gradients(
             gaussians,
@@ -98,6 +110,7 @@ class TrainingStep:
             depth_certainty=view.depth_certainty,
             pose=pose,
             closing=closing,
+            parameters=parameters,
         )
 
     def __call__(

@@ -79,11 +79,6 @@ def test_pose_alone_excludes_the_rest(options, named):
         drawn().backward(ones(3), **options)
 
 
-def test_a_view_differentiated_by_nothing():
-    with pytest.raises(ValueError, match="pose"):
-        differentiated(parameters=False)
-
-
 def bad_images(*channels: int) -> dict[str, object]:
     """Images that no argument [10, 20, channels] can be, whatever its range."""
     image = ones(*channels)
@@ -217,6 +212,16 @@ def test_nothing_to_ask_before_the_first_view(call):
     arguments = {"full_fisher": (ones(), ones()), "fisher": (ones(), ones(), FisherSums(0))}.get(call, ())
     with pytest.raises(RuntimeError, match="forward"):
         getattr(Rasterizer(), call)(*arguments)
+
+
+@pytest.mark.parametrize("name", ["inv_var_color", "inv_var_depth", "information", "observations"])
+def test_arguments_of_the_opacity_information_that_cannot_be(name):
+    rasterizer = drawn()
+    n = len(rasterizer._last_forward()[0])
+    sums = {"information": np.zeros(n), "observations": np.zeros(n, np.uint32)}
+    arguments = {"inv_var_color": ones(), "inv_var_depth": ones(), **sums}
+    with pytest.raises(REFUSED, match=name):
+        rasterizer.opacity_information(**{**arguments, name: -arguments[name][1:] - 1})
 
 
 @pytest.mark.parametrize("tolerance", [-0.1, 1.5, float("nan"), "0.05", None])

@@ -38,6 +38,9 @@ def digest(rasterizer: Rasterizer, count: int = FEW) -> str:
         gradients = rasterizer.backward(d_color, d_depth, d_alpha, pose=True, fisher=True)
         by_pose = rasterizer.backward(d_color, d_depth, d_alpha, pose=True, parameters=False)
         rasterizer.fisher(of_color, of_depth, sums, residual=of_depth)
+        opacity, seen = np.zeros(len(gaussians)), np.zeros(len(gaussians), np.uint32)
+        rasterizer.opacity_information(of_color, of_depth, opacity, seen)
+        arrays += [opacity, seen]
         arrays += [*vars(render).values(), *vars(gradients).values(), *sums.arrays().values(), by_pose.pose]
         arrays += [rasterizer.full_fisher(of_color, of_depth), *rasterizer.contributions()]
         arrays += [rasterizer.layer_depth()]
@@ -61,6 +64,10 @@ def digest(rasterizer: Rasterizer, count: int = FEW) -> str:
             depth_certainty=color[..., 0].copy(),
         )
         arrays += [a for a in vars(of_surface).values() if a is not None]
+        alone, _ = rasterizer.view_gradients(
+            *view, color=color, depth_m=depth_m, loss=SURFACE, mask=mask, depth_kind=depth, parameters=False
+        )
+        arrays += [np.array([alone.value, alone.surface])]
         statistics = rasterizer.statistics()
         arrays += [a for a in vars(gradients).values() if a is not None]
         arrays += [np.array([loss.value, loss.color, loss.depth, *loss.d_exposure])]
@@ -70,7 +77,7 @@ def digest(rasterizer: Rasterizer, count: int = FEW) -> str:
             *view, color=color, depth_m=depth_m, loss=SURFACE, mask=mask, depth_kind=depth, closing=0.05
         )
         arrays += [a for a in vars(closed_early).values() if a is not None]
-    assert len(arrays) == 2 * 41
+    assert len(arrays) == 2 * 44
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.geometry import spd
+from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
 from duagc.pipeline.kernels.types import FisherSums
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS
@@ -113,6 +114,21 @@ def test_full_information_and_its_parts(rasterizer, scene):
         )
     np.testing.assert_allclose(sums.color, diagonal[:, 10:13], rtol=1e-5)
     np.testing.assert_allclose(sums.opacity, diagonal[:, 13], rtol=1e-4, atol=1e-9 * diagonal.max())
+
+
+@pytest.mark.parametrize("depth", DEPTH_KINDS)
+def test_information_of_the_opacities_alone_is_that_of_all(scene, depth):
+    rasterizer = Rasterizer()
+    of_color, of_depth = scene.image(4, low=0.0), scene.image(5, low=0.0)
+    of_color[::3], of_depth[::2] = 0.0, 0.0
+    sums = FisherSums(len(scene.gaussians))
+    information, observations = np.zeros(len(sums)), np.zeros(len(sums), np.uint32)
+    for mask in (None, checkerboard(scene)):
+        draw(rasterizer, scene, depth_kind=depth, mask=mask)
+        rasterizer.fisher(of_color, of_depth, sums)
+        rasterizer.opacity_information(of_color, of_depth, information, observations)
+    np.testing.assert_array_equal(information, sums.opacity)
+    np.testing.assert_array_equal(observations, sums.observations)
 
 
 def test_weight_and_residual_are_sums_over_the_pixels_that_count(rasterizer, plain):

@@ -129,6 +129,19 @@ def test_view_gradients_draw_a_view_that_can_be_asked_further(rasterizer, plain)
 
 
 @pytest.mark.parametrize("depth", DEPTH_KINDS)
+@pytest.mark.parametrize("surface_weight", [0.0, 0.8])
+def test_the_loss_alone_is_that_with_derivatives(plain, depth, surface_weight):
+    color, depth_m = measured_images(plain)
+    view = plain.gaussians, plain.camera, plain.T_camera_map
+    weights = dataclasses.replace(LOSS, surface_weight=surface_weight)
+    options = {"color": color, "depth_m": depth_m, "loss": weights, "mask": checkerboard(plain)}
+    wanted, _ = Rasterizer().view_gradients(*view, **options, depth_kind=depth)
+    loss, nothing = Rasterizer().view_gradients(*view, **options, depth_kind=depth, parameters=False)
+    assert loss == wanted
+    assert set(vars(nothing).values()) == {None}
+
+
+@pytest.mark.parametrize("depth", DEPTH_KINDS)
 def test_a_pixel_that_closes_early_is_that_of_the_reference(plain, depth):
     color, depth_m = measured_images(plain)
     view = plain.gaussians, plain.camera, plain.T_camera_map

@@ -109,7 +109,6 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
             const Mask stays_open = block.left >= least;
             weight_if_open = select(stays_open, weight_if_open, before);
             alpha[k] = select(stays_open, alpha[k], Vec(1.0f));
-            block.T = select(blended, select_or_zero(stays_open, block.left), block.T);
         } else {
             blended = (block.left >= least) & seen[k];
             block.T = select(blended, block.left, block.T);
@@ -140,6 +139,8 @@ NO_INLINE static uint32_t blend_candidates(const Splat* splats, const TileItems 
         kept = blend_some<KIND, ABREAST>(splats, items.positions + i, items, kept, memory, block);
     for (; i < count && block.open(least); i++) kept = blend_some<KIND, 1>(splats, items.positions + i, items, kept, memory, block);
     evaluated += i;
+    if constexpr (Kept::CLOSES)  // an open pixel blended all that it saw, and nothing is left of a closed one
+        block.T = select(Vec(0.0f) < result.left, select_or_zero(block.left >= least, block.left), block.T);
     result = block;
     return kept;
 }

@@ -99,9 +99,26 @@ struct TermOfDepth {
     }
 };
 
+// Sums a term of depth over the items of a block, from the last to the first.
+template <DepthKind KIND, class Term>
+inline void sum_term(const Sweep& sweep, const Block& block, uint32_t count, const Memory& memory, Term& term) {
+    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
+    for (uint32_t k = count; k-- > 0;) {
+        Vec slope;
+        const Vec depth = depth_at<KIND>(sweep.splats[sweep.items.positions[k]], pixel_x, pixel_y);
+        term.add(depth, load(memory.weights + static_cast<size_t>(k) * LANES), slope);
+    }
+}
+// What a block says about its Gaussians and adds to a term of depth.
+template <Derivatives D, DepthKind KIND, class Term>
+inline void sweep_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v, const Memory& memory, Term& term) {
+    if constexpr (D != Derivatives::NONE) gradient_block<D, KIND>(sweep, block, count, v, Recall{memory}, term);
+    else if constexpr (Term::ACTIVE) sum_term<KIND>(sweep, block, count, memory, term);
+}
+
 template <Derivatives D, DepthKind KIND>
 inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScales& scales) {
-    Sweep sweep = Sweep::begin<ROW_OF<D, KIND>>(frame, index);
+    Sweep sweep = Sweep::begin<D == Derivatives::NONE ? 0 : ROW_OF<D, KIND>>(frame, index);
     const View& view = frame.view;
     Measured measured[BLOCKS];
     bool bad[3] = {};
@@ -141,11 +158,11 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         if (next.counts[b]) {
             if (loss.surface_weight > 0.0f) {
                 TermOfDepth term(measured[b], wanted, loss, scales);
-                gradient_block<D, KIND>(sweep, block, next.counts[b], v, Recall{memory}, term);
+                sweep_block<D, KIND>(sweep, block, next.counts[b], v, memory, term);
                 sums.surface += select_or_zero(Vec(0.0f) < term.scale, term.sum);
             } else {
                 NoTermOfDepth none;
-                gradient_block<D, KIND>(sweep, block, next.counts[b], v, Recall{memory}, none);
+                sweep_block<D, KIND>(sweep, block, next.counts[b], v, memory, none);
             }
         }
         sweep.items = next;

@@ -243,6 +243,9 @@ struct Kernels {
     // residual may be null.
     Status (*fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, const float* residual,
                      const FisherArrays&);
+    // information, observations: [n], added to
+    Status (*opacity_information)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth,
+                                  double* information, uint32_t* observations);
     void (*contributions)(Frame&, float* weights, uint32_t* pixels);
     void (*layer_depth)(Frame&, float tolerance, float* depth);
     // information: [n, 14, 14]

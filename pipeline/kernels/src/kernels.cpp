@@ -4,6 +4,7 @@
 #include "full_information.h"
 #include "layer.h"
 #include "machine_peak.h"
+#include "opacity.h"
 
 namespace KERNEL_ISA {
 
@@ -14,15 +15,8 @@ static Status by_depth_kind(const Frame& frame, Call call) {
     return call(std::integral_constant<DepthKind, DepthKind::blended>{});
 }
 
-// Everything before the pixels.
-static Status prepare(Frame& frame, const GaussianArrays& gaussians) {
-    const Status status = make_lists(frame, gaussians);
-    if (status == Status::ok && frame.view.depth == DepthKind::ray_plane) set_depth_slopes(frame, gaussians);
-    return status;
-}
-
 static Status forward(Frame& frame, const GaussianArrays& gaussians, float* color, float* depth, float* alpha) {
-    const Status status = prepare(frame, gaussians);
+    const Status status = make_lists(frame, gaussians);
     if (status != Status::ok) return status;
     return by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
@@ -83,6 +77,20 @@ static Status fisher(Frame& frame, const GaussianArrays& gaussians, const float*
     });
 }
 
+static Status opacity_information(Frame& frame, const GaussianArrays& gaussians, const float* inv_var_color, const float* inv_var_depth,
+                                  double* information, uint32_t* observations) {
+    return by_depth_kind(frame, [&](auto kind) {
+        constexpr DepthKind KIND = kind;
+        frame.rows.need(frame.intersection_count * OPACITY_ROW);
+        const Status status = over_tiles(frame, [&](int tile) { return opacity_tile<KIND>(frame, tile, inv_var_color, inv_var_depth); });
+        if (status != Status::ok) return status;
+        const int groups = static_cast<int>(group_count(frame));
+#pragma omp parallel for schedule(static) num_threads(frame.threads) if (frame.threads > 1)
+        for (int group = 0; group < groups; group++) opacity_group(frame, gaussians, group, information, observations);
+        return status;
+    });
+}
+
 // All cross terms, for validation: both kinds of depth take the same sums.
 static Status full_fisher(Frame& frame, const GaussianArrays& gaussians, const float* inv_var_color, const float* inv_var_depth,
                           double* information) {
@@ -129,7 +137,7 @@ static void layer_depth(Frame& frame, float tolerance, float* depth) {
 
 template <Derivatives D>
 static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {
-    Status status = prepare(frame, gaussians);
+    Status status = make_lists(frame, gaussians);
     if (status != Status::ok) return status;
     const int tiles = frame.tiles_x * frame.tiles_y;
     frame.front.need((frame.longest_list + 1) * LANES * 2 * frame.threads);
@@ -137,9 +145,10 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
     const LossScales scales(PixelCounts(frame.view, loss.depth_m));
     status = by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
-        frame.rows.need(frame.intersection_count * ROW_OF<D, KIND>);
+        if constexpr (D != Derivatives::NONE) frame.rows.need(frame.intersection_count * ROW_OF<D, KIND>);
         const Status of_tiles = over_tiles(frame, [&](int tile) { return fit_tile<D, KIND>(frame, tile, loss, scales); });
-        if (of_tiles == Status::ok) gradients_of_parameters<D, KIND>(frame, gaussians, out);
+        if constexpr (D != Derivatives::NONE)
+            if (of_tiles == Status::ok) gradients_of_parameters<D, KIND>(frame, gaussians, out);
         return of_tiles;
     });
     if (status != Status::ok) return status;
@@ -151,7 +160,8 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
     return Status::ok;
 }
 static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {
-    return (out.means ? fit<Derivatives::ALL> : fit<Derivatives::POSE>)(frame, gaussians, loss, values, out);
+    const auto of = out.means ? fit<Derivatives::ALL> : out.pose ? fit<Derivatives::POSE> : fit<Derivatives::NONE>;
+    return of(frame, gaussians, loss, values, out);
 }
 
 }  // namespace KERNEL_ISA
@@ -163,6 +173,6 @@ namespace raster {
 extern const RegistrationKernels REGISTRATION_TABLE;
 extern const Kernels KERNEL_TABLE;
 const Kernels KERNEL_TABLE = {AS_TEXT(KERNEL_ISA), &REGISTRATION_TABLE, KERNEL_ISA::forward, KERNEL_ISA::backward, KERNEL_ISA::fisher,
-                              KERNEL_ISA::contributions, KERNEL_ISA::layer_depth, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam,
+                              KERNEL_ISA::opacity_information, KERNEL_ISA::contributions, KERNEL_ISA::layer_depth, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam,
                               KERNEL_ISA::fma_rate, KERNEL_ISA::bandwidth};
 }  // namespace raster

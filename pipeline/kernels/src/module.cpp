@@ -161,6 +161,16 @@ public:
             kernels_->fisher(frame_, gaussians, inv_var_color.data(), inv_var_depth.data(), data_or_null(residual), out));
     }
 
+    int opacity_information(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
+                            const Inputs& inv_var_color, const Inputs& inv_var_depth, const Array<double>& information,
+                            const Array<uint32_t>& observations) {
+        const Use use(busy_);
+        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
+        const nb::gil_scoped_release unlocked;
+        return static_cast<int>(kernels_->opacity_information(frame_, gaussians, inv_var_color.data(), inv_var_depth.data(),
+                                                              information.data(), observations.data()));
+    }
+
     int full_fisher(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
                     const Inputs& inv_var_color, const Inputs& inv_var_depth, const Array<double>& information) {
         const Use use(busy_);
@@ -246,6 +256,7 @@ NB_MODULE(_raster, m) {
              "g_quats"_a, "g_log_scales"_a, "g_colors"_a, "g_logits"_a, "g_pose"_a, "certainty"_a.none() = nb::none())
         .def("backward", &Raster::backward)
         .def("fisher", &Raster::fisher)
+        .def("opacity_information", &Raster::opacity_information)
         .def("full_fisher", &Raster::full_fisher)
         .def("contributions", &Raster::contributions)
         .def("layer_depth", &Raster::layer_depth);

@@ -151,24 +151,6 @@ inline Vec quadratic_form(const Gram& gram, int row, int column, const Vec* a, c
 
 inline size_t group_count(const Frame& frame) { return (frame.visible + LANES - 1) / LANES; }
 
-// Completes the splats of the visible Gaussians for ray_plane.
-inline void set_depth_slopes(Frame& frame, const GaussianArrays& gaussians) {
-    const int groups = static_cast<int>(group_count(frame));
-#pragma omp parallel for schedule(static) num_threads(frame.threads) if (frame.threads > 1)
-    for (int g = 0; g < groups; g++) {
-        const Group group(frame, gaussians, g);
-        Vec slopes[2];
-        alignas(64) float lanes[2][LANES];
-        depth_slopes(group.splat, slopes);
-        for (int k = 0; k < 2; k++) store(lanes[k], slopes[k]);
-        for (int lane = 0; lane < group.lanes; lane++) {
-            Splat& splat = frame.splats.data()[group.ids[lane]];
-            splat.slope_x = lanes[0][lane];
-            splat.slope_y = lanes[1][lane];
-        }
-    }
-}
-
 // ---------------------------------------------------------------- gradients
 
 // Diagonal of the information in mean 3, quaternion 4, log-scale 3, color 3, logit 1; of_color: that of the colors.

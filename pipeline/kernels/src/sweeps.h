@@ -38,9 +38,13 @@ struct Sweep {
     template <int ROW>
     static Sweep begin(Frame& frame, int index) {
         Sweep sweep(frame, Tile(frame, index));
-        for (uint32_t i = 0; i < sweep.tile.count; i++)
-            for (int first = 0; first < ROW; first += LANES)
-                store(sweep.rows + static_cast<size_t>(sweep.list_rows[i]) * ROW + first, Vec(0.0f));
+        for (uint32_t i = 0; ROW > 0 && i < sweep.tile.count; i++) {
+            float* row = sweep.rows + static_cast<size_t>(sweep.list_rows[i]) * ROW;
+            if constexpr (ROW % LANES == 0)
+                for (int first = 0; first < ROW; first += LANES) store(row + first, Vec(0.0f));
+            else
+                std::memset(row, 0, ROW * sizeof(float));
+        }
         return sweep;
     }
 
@@ -61,7 +65,7 @@ ALWAYS_INLINE inline void over_batches(const Sweep& sweep, uint32_t count, Visit
 
 // ---------------------------------------------------------------- gradient
 
-enum class Derivatives { POSE, ALL, ALL_AND_SQUARES };  // of the pose alone; of all parameters; and their squares per pixel
+enum class Derivatives { NONE, POSE, ALL, ALL_AND_SQUARES };  // of the pose alone; of all parameters; and their squares per pixel
 
 template <Derivatives D, DepthKind KIND>
 constexpr int ROW_OF = D == Derivatives::ALL_AND_SQUARES ? SQUARES_ROW<KIND> : GRADIENT_ROW;

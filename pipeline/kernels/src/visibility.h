@@ -137,6 +137,7 @@ inline void footprint_columns(const View& view, const Splat16& s, Vec extent_x, 
 }
 
 // Writes the splats and footprints from `first` on, and the keys of those that are drawn; returns how many are.
+template <DepthKind KIND>
 inline uint32_t project_group(Frame& frame, const Neighbors16& g, size_t first, uint32_t lanes, uint64_t* keys) {
     const View& view = frame.view;
     const Splat16 s = project16(view, g.p.mean, g.p.quat, g.p.log_scale);
@@ -148,8 +149,10 @@ inline uint32_t project_group(Frame& frame, const Neighbors16& g, size_t first, 
     const uint32_t drawn_lanes = bits(drawn) & lanes;
     if (!drawn_lanes) return 0;
 
+    Vec slopes[2] = {zero, zero};
+    if constexpr (KIND == DepthKind::ray_plane) depth_slopes(s, slopes);
     const Vec splat[16] = {s.u, s.v, s.M11, s.M12, s.M22, log2_opacity, g.color[0], g.color[1], g.color[2], s.z,
-                           zero, zero, zero, zero, zero, zero};
+                           slopes[0], slopes[1], zero, zero, zero, zero};
     store_rows16(reinterpret_cast<float*>(frame.splats.data() + first), splat);
     Vec footprint[8];
     footprint_columns(view, s, extent_x, extent_y, footprint);
@@ -170,6 +173,7 @@ inline uint32_t project_group(Frame& frame, const Neighbors16& g, size_t first, 
 constexpr size_t CHUNK = 32 * LANES;  // Gaussians that are projected together
 
 // Projects one chunk; false if a parameter is not usable. Flat, because most of a Splat16 serves only the way back.
+template <DepthKind KIND>
 __attribute__((flatten)) inline bool project_chunk(Frame& frame, const GaussianArrays& gaussians, size_t chunk) {
     const size_t begin = chunk * CHUNK, end = begin + CHUNK < gaussians.count ? begin + CHUNK : gaussians.count;
     uint64_t* keys = frame.depth_keys.data() + begin;
@@ -179,7 +183,7 @@ __attribute__((flatten)) inline bool project_chunk(Frame& frame, const GaussianA
         const Neighbors16 g(gaussians, first);
         const uint32_t lanes = end - first < LANES ? (1u << (end - first)) - 1 : 0xffffu;
         all_usable &= usable(g);
-        if (any(may_be_seen(frame.view, g.p))) drawn += project_group(frame, g, first, lanes, keys + drawn);
+        if (any(may_be_seen(frame.view, g.p))) drawn += project_group<KIND>(frame, g, first, lanes, keys + drawn);
     }
     frame.chunk_drawn.data()[chunk] = drawn;
     return all_usable;
@@ -193,9 +197,10 @@ inline bool project_all(Frame& frame, const GaussianArrays& gaussians) {
     frame.footprints.need(chunks * CHUNK);
     frame.depth_keys.need(chunks * CHUNK);
     frame.chunk_drawn.need(chunks);
+    const auto project = frame.view.depth == DepthKind::ray_plane ? project_chunk<DepthKind::ray_plane> : project_chunk<DepthKind::blended>;
     int unusable = 0;
 #pragma omp parallel for schedule(static, 1) num_threads(frame.threads) reduction(+ : unusable) if (frame.threads > 1)
-    for (size_t chunk = 0; chunk < chunks; chunk++) unusable += !project_chunk(frame, gaussians, chunk);
+    for (size_t chunk = 0; chunk < chunks; chunk++) unusable += !project(frame, gaussians, chunk);
     return unusable == 0;
 }
 
