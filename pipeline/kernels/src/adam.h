@@ -8,7 +8,7 @@ namespace KERNEL_ISA {
 
 using namespace raster;
 
-constexpr size_t ADAM_ROWS = 64;  // Gaussians at a time: their factors stay in the nearest cache
+constexpr size_t ADAM_ROWS = 16;  // Gaussians at a time: often none of so few was touched
 
 // Counts the step of every Gaussian that the view touched; its bias correction, or 0 if it was not touched.
 inline bool count_steps(const AdamStep& step, size_t begin, size_t end, float* correction) {
