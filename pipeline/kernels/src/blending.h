@@ -128,17 +128,18 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
 }
 
 // Blends the candidates of one block, which stand at the beginning of `items`; keeps those that were blended, in place.
-// Returns how many, and in `evaluated` how many it looked at.
+// Returns how many, and in `evaluated` how many it looked at. The last few are filled up with `unseen`.
 template <DepthKind KIND, class Kept>
-NO_INLINE static uint32_t blend_candidates(const Splat* splats, const TileItems items, uint32_t count, const Kept memory, OpenBlock& result,
-                                           uint64_t& evaluated) {
+NO_INLINE static uint32_t blend_candidates(const Splat* splats, const TileItems items, uint32_t count, uint32_t unseen, const Kept memory,
+                                           OpenBlock& result, uint64_t& evaluated) {
     OpenBlock block = result;
     const Vec least(memory.least());
     uint32_t kept = 0, i = 0;
-    for (; i + ABREAST <= count && block.open(least); i += ABREAST)
+    static_assert(ABREAST <= LIST_SPARE, "");
+    for (uint32_t k = count; k % ABREAST; k++) items.positions[k] = unseen;
+    for (; i < count && block.open(least); i += ABREAST)
         kept = blend_some<KIND, ABREAST>(splats, items.positions + i, items, kept, memory, block);
-    for (; i < count && block.open(least); i++) kept = blend_some<KIND, 1>(splats, items.positions + i, items, kept, memory, block);
-    evaluated += i;
+    evaluated += i < count ? i : count;
     if constexpr (Kept::CLOSES)  // an open pixel blended all that it saw, and nothing is left of a closed one
         block.T = select(Vec(0.0f) < result.left, select_or_zero(block.left >= least, block.left), block.T);
     result = block;
@@ -151,7 +152,7 @@ inline OpenBlock blend_block(const Frame& frame, const Tile& tile, const Splat* 
                              const Kept& memory, TileItems& items, uint64_t& evaluated) {
     OpenBlock image(block, wanted);
     const uint32_t count = positions_with_bit(frame.list_blocks.data() + tile.first, tile.count, b, items.positions);
-    items.counts[b] = blend_candidates<KIND>(splats, items, count, memory, image, evaluated);
+    items.counts[b] = blend_candidates<KIND>(splats, items, count, tile.count, memory, image, evaluated);
     store(items.T + b * LANES, image.T);
     items.skip(items.counts[b]);
     return image;

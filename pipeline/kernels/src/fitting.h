@@ -99,6 +99,24 @@ struct TermOfDepth {
     }
 };
 
+// Fetches a sixteenth of what the next tile will read, while this one is at work.
+inline void fetch_ahead(const Frame& frame, int index, int part, const Loss& loss) {
+    if (index >= frame.tiles_x * frame.tiles_y) return;
+    const Tile tile(frame, index);
+    const uint32_t* list = frame.list_splats.data() + tile.first;
+    for (uint32_t i = tile.count * part / BLOCKS; i < tile.count * (part + 1) / BLOCKS; i++) __builtin_prefetch(frame.splats.data() + list[i]);
+    const int y = tile.y + part, right = smaller(tile.x + TILE, frame.view.width);
+    if (y >= frame.view.height) return;
+    const size_t begin = static_cast<size_t>(y) * frame.view.width + tile.x, end = begin + (right - tile.x);
+    const auto fetch = [](const float* from, const float* to) {
+        for (; from < to; from += 64 / sizeof(float)) __builtin_prefetch(from);
+        __builtin_prefetch(to - 1);
+    };
+    fetch(loss.color + 3 * begin, loss.color + 3 * end);
+    fetch(loss.depth_m + begin, loss.depth_m + end);
+    if (loss.certainty) fetch(loss.certainty + begin, loss.certainty + end);
+}
+
 // Sums a term of depth over the items of a block, from the last to the first.
 template <DepthKind KIND, class Term>
 inline void sum_term(const Sweep& sweep, const Block& block, uint32_t count, const Memory& memory, Term& term) {
@@ -143,10 +161,15 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
     LossLanes sums;
     uint64_t evaluated = 0;
     for (int b = 0; b < BLOCKS; b++) {
+        fetch_ahead(frame, index + 1, b, loss);
         const Block block(sweep.tile, b, view);
         sweep.items.counts[b] = 0;
         if (block.outside(view)) continue;
         const Mask wanted = mask_of_bits(block.wanted(view));
+        if (!any(wanted)) {
+            store(sweep.items.T + b * LANES, Vec(1.0f));
+            continue;
+        }
         TileItems next = sweep.items;
         const OpenBlock image =
             loss.closing > TRANSMITTANCE_MIN
@@ -167,6 +190,7 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         }
         sweep.items = next;
     }
+    if constexpr (D != Derivatives::NONE) sweep.template end<ROW_OF<D, KIND>>(frame);
     frame.evaluated.data()[index] = evaluated;
     sums.store_sums(frame.loss_parts.data() + static_cast<size_t>(index) * LOSS_SUMS);
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;

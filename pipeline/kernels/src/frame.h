@@ -98,7 +98,7 @@ struct alignas(32) Footprint {
 struct RecordRange {
     uint32_t count, first;
 };
-// What a record still lacks to enter a list: index in the caller's arrays, and what leads from the record to its row.
+// What a record still lacks to enter a list: index in the caller's arrays, and what leads from the record to its row, or the row.
 struct ListEntry {
     uint32_t id, to_row;
 };
@@ -150,7 +150,7 @@ struct Frame {
     Scratch<uint32_t> rows_of_id;            // by index in the caller's arrays: number of rows, then the first
     uint64_t records_found = 0;              // by all bands; too many end the search
     Scratch<uint32_t> visible_ids;           // index of those that touch a tile, ascending
-    Scratch<uint32_t> first_row;             // per visible Gaussian, visible + 1: its rows of sums are contiguous
+    Scratch<uint32_t> first_row;             // per visible Gaussian, visible + 1: its rows of sums are contiguous, in order of tiles
     Scratch<uint32_t> tile_start;            // tiles + 1
     // Gaussians of each tile, by tile, then depth: index in `splats`, row of sums, bit b: may touch 4x4 block b.
     Scratch<uint32_t> list_splats, list_rows;
@@ -165,7 +165,9 @@ struct Frame {
     Scratch<Splat> tile_splats;              // per thread: the splats of one tile's list
     size_t longest_list = 0;
     Scratch<float> front;                    // per thread: alpha and weight of one block's items
-    Scratch<float> rows;                     // sums: of one Gaussian in one tile each
+    Scratch<float> tile_rows;                // per thread: sums of the Gaussians of one tile's list
+    Scratch<float> rows;                     // sums: of one Gaussian in one tile each, or in all of them
+    bool one_row = false;                    // of a Gaussian, for all of its tiles: one thread adds them up in their order
     Scratch<double> pose_parts, loss_parts;  // loss_parts: [tiles, LOSS_SUMS]
 
     size_t bytes() const {  // held between calls
@@ -173,7 +175,7 @@ struct Frame {
         const auto add = [&](const auto&... memory) { total += (memory.bytes() + ...); };
         add(splats, footprints, depth_keys, chunk_drawn, chunk_rows, row_weights, wanted_blocks, rows_of_id, visible_ids, first_row, tile_start,
             list_splats, list_rows, list_blocks, item_start, block_items, item_positions, item_pixels, transmittance, evaluated, tile_splats,
-            front, rows, pose_parts, loss_parts);
+            front, tile_rows, rows, pose_parts, loss_parts);
         for (const Band& band : bands)
             add(band.ids, band.own_footprints, band.chunk_first, band.keys, band.keys_swap, band.order, band.ranges, band.rows_above,
                 band.entries, band.record_tiles, band.record_members, band.record_blocks, band.tile_places);

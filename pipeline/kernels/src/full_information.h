@@ -53,7 +53,7 @@ NO_INLINE static void full_block(const Sweep& sweep, const Block& block, uint32_
                 set_parts(sums + FULL_COLOR + channel * monomials(2), half, of_channel);
             }
         }
-        add_to_rows<FULL_ROW>(batch, sums, sweep.rows, sweep.list_rows);
+        add_to_rows<FULL_ROW>(batch, sums, sweep.rows);
     });
 }
 

@@ -48,7 +48,7 @@ static Status backward(Frame& frame, const GaussianArrays& gaussians, const floa
                        const float* d_alpha, const GradientArrays& out) {
     return by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
-        frame.rows.need(frame.intersection_count * ROW_OF<D, KIND>);
+        prepare_rows<ROW_OF<D, KIND>>(frame);
         const Status status = over_tiles(frame, [&](int tile) { return gradient_tile<D, KIND>(frame, tile, d_color, d_depth, d_alpha); });
         if (status == Status::ok) gradients_of_parameters<D, KIND>(frame, gaussians, out);
         return status;
@@ -66,7 +66,7 @@ static Status fisher(Frame& frame, const GaussianArrays& gaussians, const float*
                      const float* residual, const FisherArrays& out) {
     return by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
-        frame.rows.need(frame.intersection_count * INFORMATION_ROW);
+        prepare_rows<INFORMATION_ROW>(frame);
         const Status status =
             over_tiles(frame, [&](int tile) { return information_tile<KIND>(frame, tile, inv_var_color, inv_var_depth, residual); });
         if (status != Status::ok) return status;
@@ -81,7 +81,7 @@ static Status opacity_information(Frame& frame, const GaussianArrays& gaussians,
                                   double* information, uint32_t* observations) {
     return by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
-        frame.rows.need(frame.intersection_count * OPACITY_ROW);
+        prepare_rows<OPACITY_ROW>(frame);
         const Status status = over_tiles(frame, [&](int tile) { return opacity_tile<KIND>(frame, tile, inv_var_color, inv_var_depth); });
         if (status != Status::ok) return status;
         const int groups = static_cast<int>(group_count(frame));
@@ -96,7 +96,7 @@ static Status full_fisher(Frame& frame, const GaussianArrays& gaussians, const f
                           double* information) {
     return by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
-        frame.rows.need(frame.intersection_count * FULL_ROW);
+        prepare_rows<FULL_ROW>(frame);
         const Status status = over_tiles(frame, [&](int tile) { return full_tile<KIND>(frame, tile, inv_var_color, inv_var_depth); });
         if (status != Status::ok) return status;
         const int groups = static_cast<int>(group_count(frame));
@@ -107,7 +107,7 @@ static Status full_fisher(Frame& frame, const GaussianArrays& gaussians, const f
 }
 
 static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
-    frame.rows.need(frame.intersection_count * GRADIENT_ROW);
+    prepare_rows<GRADIENT_ROW>(frame);
     over_tiles(frame, [&](int tile) {
         contribution_tile(frame, tile);
         return Status::ok;
@@ -145,7 +145,7 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
     const LossScales scales(PixelCounts(frame.view, loss.depth_m));
     status = by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
-        if constexpr (D != Derivatives::NONE) frame.rows.need(frame.intersection_count * ROW_OF<D, KIND>);
+        if constexpr (D != Derivatives::NONE) prepare_rows<ROW_OF<D, KIND>>(frame);
         const Status of_tiles = over_tiles(frame, [&](int tile) { return fit_tile<D, KIND>(frame, tile, loss, scales); });
         if constexpr (D != Derivatives::NONE)
             if (of_tiles == Status::ok) gradients_of_parameters<D, KIND>(frame, gaussians, out);

@@ -342,9 +342,9 @@ inline RowsAndVisible assign_rows(Frame& frame, Band& band) {
         const uint32_t id = ids[i];
         visible_ids[start.visible] = id;
         first_row[start.visible] = start.rows;
-        entries[id] = {id, start.rows - ranges[id].first};
+        entries[id] = {id, frame.one_row ? start.rows : start.rows - ranges[id].first};
         start.visible += ranges[id].count > 0;
-        start.rows += ranges[id].count;
+        start.rows += frame.one_row ? ranges[id].count > 0 : ranges[id].count;
     }
     return start;
 }
@@ -356,6 +356,7 @@ inline void assign_all_rows(Frame& frame) {
     frame.visible_ids.need(most);
     frame.first_row.need(most);
     RowsAndVisible end, *starts = frame.chunk_rows.need(frame.chunks);
+    frame.one_row = frame.threads == 1;
     if (frame.band_count == 1)
         end = assign_rows(frame, frame.bands[0]);
     else {
@@ -404,7 +405,7 @@ inline void write_lists(Frame& frame, Band& band, uint32_t start) {
         const ListEntry entry = entries[record_members[r]];
         const uint32_t p = place[record_tiles[r]]++;
         splats[p] = entry.id;
-        rows[p] = static_cast<uint32_t>(r) + entry.to_row;
+        rows[p] = frame.one_row ? entry.to_row : static_cast<uint32_t>(r) + entry.to_row;
         blocks[p] = record_blocks[r];
     }
 }

@@ -33,7 +33,7 @@ NO_INLINE static void opacity_block(const Sweep& sweep, const Block& block, uint
         alignas(64) float totals[BATCH];
         store(totals, total);
         for (int k = 0; k < batch.count; k++) {
-            float* row = sweep.rows + static_cast<size_t>(sweep.list_rows[batch.positions[k]]) * OPACITY_ROW;
+            float* row = sweep.rows + static_cast<size_t>(batch.positions[k]) * OPACITY_ROW;
             row[OPACITY_1] += totals[k];
             row[OPACITY_SEEN] = batch.pixels[k] & used ? 1.0f : row[OPACITY_SEEN];
         }

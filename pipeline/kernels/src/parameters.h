@@ -15,12 +15,13 @@ struct Members {
         const uint32_t* order = frame.visible_ids.data() + first;
         for (int lane = 0; lane < LANES; lane++) ids[lane] = order[lane < lanes ? lane : 0];
     }
+    bool side_by_side() const { return ids[LANES - 1] == ids[0] + LANES - 1; }  // in the arrays; ids ascend
 };
 struct Group : Members {
     const Parameters16 parameters;
     const Splat16 splat;  // projected once more: cheaper than to keep it
     Group(const Frame& frame, const GaussianArrays& gaussians, size_t group)
-        : Members(frame, group), parameters(gather_parameters(gaussians, ids)),
+        : Members(frame, group), parameters(side_by_side() ? load_parameters(gaussians, ids[0]) : gather_parameters(gaussians, ids)),
           splat(project16(frame.view, parameters.mean, parameters.quat, parameters.log_scale)) {}
 
     // Sums of the rows of each Gaussian, in order of the rows; sums[k] holds column k.

@@ -117,13 +117,13 @@ ALWAYS_INLINE inline void unused_sums(Vec* sums) {
         sums[USED + k] = zero;
     });
 }
-// Adds sums[ROW], whose lanes are the batch's items, to the items' rows.
+// Adds sums[ROW], whose lanes are the batch's items, to the items' rows in the tile.
 template <int ROW>
-inline void add_to_rows(const Batch& batch, Vec* sums, float* rows, const uint32_t* list_rows) {
+inline void add_to_rows(const Batch& batch, Vec* sums, float* tile_rows) {
     for (int first = 0; first < ROW; first += LANES) {
         transpose16(sums + first);
         for (int k = 0; k < batch.count; k++) {
-            float* row = rows + static_cast<size_t>(list_rows[batch.positions[k]]) * ROW + first;
+            float* row = tile_rows + static_cast<size_t>(batch.positions[k]) * ROW + first;
             store(row, load(row) + sums[first + k]);
         }
     }

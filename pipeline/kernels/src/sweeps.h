@@ -26,32 +26,59 @@ inline void touch_items(const Frame& frame, int index) {
     touch(items.pixels, count);
 }
 
-// A tile whose blocks are walked back to front; clears the rows of its list.
+// Room for the sums of a sweep.
+template <int ROW>
+inline void prepare_rows(Frame& frame) {
+    const size_t count = (frame.one_row ? frame.visible : frame.intersection_count) * ROW;
+    frame.rows.need(count);
+    if (frame.one_row) std::memset(frame.rows.data(), 0, count * sizeof(float));
+    frame.tile_rows.need(frame.longest_list * ROW * frame.threads);
+}
+
+// A tile whose blocks are walked back to front. Sums are added up near by, and written when the tile is done: rows lie far
+// apart in memory, and many Gaussians of a list are hidden in the tile.
 struct Sweep {
     const View& view;
     const Tile tile;
     const Splat* splats;
-    const uint32_t* list_rows;
-    float* rows;
+    float* rows;  // of the tile's list
     TileItems items;
 
     template <int ROW>
     static Sweep begin(Frame& frame, int index) {
-        Sweep sweep(frame, Tile(frame, index));
-        for (uint32_t i = 0; ROW > 0 && i < sweep.tile.count; i++) {
-            float* row = sweep.rows + static_cast<size_t>(sweep.list_rows[i]) * ROW;
-            if constexpr (ROW % LANES == 0)
-                for (int first = 0; first < ROW; first += LANES) store(row + first, Vec(0.0f));
-            else
-                std::memset(row, 0, ROW * sizeof(float));
-        }
+        Sweep sweep(frame, Tile(frame, index), frame.tile_rows.data() + this_thread() * frame.longest_list * ROW);
+        if (ROW > 0) std::memset(sweep.rows, 0, sweep.tile.count * ROW * sizeof(float));
         return sweep;
+    }
+    template <int ROW>
+    void end(Frame& frame) const {
+        const uint32_t* places = frame.list_rows.data() + tile.first;
+        for (uint32_t i = 0; i < tile.count; i++) {
+            const float* row = rows + static_cast<size_t>(i) * ROW;
+            float* out = frame.rows.data() + static_cast<size_t>(places[i]) * ROW;
+            if (!frame.one_row)
+                std::memcpy(out, row, ROW * sizeof(float));
+            else if (any_nonzero<ROW>(row))
+                for (int k = 0; k < ROW; k++) out[k] += row[k];
+        }
     }
 
 private:
-    Sweep(Frame& frame, const Tile& t)
-        : view(frame.view), tile(t), splats(gather_splats(frame, t)), list_rows(frame.list_rows.data() + t.first),
-          rows(frame.rows.data()), items(frame, t.index) {}
+    Sweep(Frame& frame, const Tile& t, float* tile_rows)
+        : view(frame.view), tile(t), splats(gather_splats(frame, t)), rows(tile_rows), items(frame, t.index) {}
+
+    template <int ROW>
+    static bool any_nonzero(const float* row) {
+        bool zero = true;
+        if constexpr (ROW % LANES == 0)
+            for (int first = 0; first < ROW; first += LANES) {
+                const Vec part = load(row + first);
+                zero &= bits((part >= Vec(0.0f)) & (part <= Vec(0.0f))) == 0xffffu;
+            }
+        else
+            for (int k = 0; k < ROW; k++) zero &= row[k] == 0.0f;
+        return !zero;
+    }
 };
 
 // Calls visit(batch) for the batches of a block from the last to the first.
@@ -157,7 +184,7 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
             if constexpr (D == Derivatives::ALL_AND_SQUARES)
                 sum_squares<KIND>(w, f, v, squared, shape, block, half, sums + GRADIENT_SUMS<KIND>);
         }
-        add_to_rows<ROW>(batch, sums, sweep.rows, sweep.list_rows);
+        add_to_rows<ROW>(batch, sums, sweep.rows);
     });
 }
 
@@ -189,6 +216,7 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
         gradient_block<D, KIND>(sweep, block, count, cotangents[b], Replay(block, sweep.items.T + b * LANES), none);
         sweep.items.skip(count);
     }
+    sweep.end<ROW_OF<D, KIND>>(frame);
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
 }
 
@@ -243,7 +271,7 @@ NO_INLINE static void information_block(const Sweep& sweep, const Block& block, 
             set_part(sums[INFO_WEIGHT], half, of_weights[0]);
             set_part(sums[INFO_RESIDUAL], half, of_weights[1]);
         }
-        add_to_rows<INFORMATION_ROW>(batch, sums, sweep.rows, sweep.list_rows);
+        add_to_rows<INFORMATION_ROW>(batch, sums, sweep.rows);
     });
 }
 
@@ -274,6 +302,7 @@ inline Status over_precisions(Frame& frame, int index, const float* inv_var_colo
         of_block(sweep, block, count, precisions[b], Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
+    sweep.end<ROW>(frame);
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
 }
 template <DepthKind KIND>
@@ -296,7 +325,7 @@ NO_INLINE static void contribution_block(const Sweep& sweep, uint32_t count, Rep
         sums[0] = f[0];
         for (int p = 1; p < LANES; p++) sums[0] += f[p];
         sums[1] = load(pixels);
-        add_to_rows<GRADIENT_ROW>(batch, sums, sweep.rows, sweep.list_rows);
+        add_to_rows<GRADIENT_ROW>(batch, sums, sweep.rows);
     });
 }
 
@@ -310,6 +339,7 @@ inline void contribution_tile(Frame& frame, int index) {
         contribution_block(sweep, count, Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
+    sweep.end<GRADIENT_ROW>(frame);
 }
 
 }  // namespace KERNEL_ISA

@@ -38,6 +38,15 @@ struct Block {
     uint32_t wanted(const View& view) const {
         if (whole && !view.mask) return 0xffffu;
         uint32_t lanes = 0;
+        if (whole) {
+            for (int row = 0; row < 4; row++) {
+                uint32_t bytes;
+                std::memcpy(&bytes, view.mask + pixel + static_cast<size_t>(row) * view.width, sizeof bytes);
+                bytes = (((bytes & 0x7f7f7f7fu) + 0x7f7f7f7fu) | bytes) >> 7 & 0x01010101u;  // 1 for each that is not 0
+                lanes |= (bytes * 0x01020408u >> 24 & 15) << 4 * row;
+            }
+            return lanes;
+        }
         for_each(view, [&](int lane, size_t p) { lanes |= static_cast<uint32_t>(!view.mask || view.mask[p]) << lane; });
         return lanes;
     }
@@ -104,12 +113,15 @@ inline int this_thread() {
 #endif
 }
 
-// Copies of the splats of a tile's list, one behind the other: its blocks come back to them many times.
+// Copies of the splats of a tile's list, one behind the other: its blocks come back to them many times. Behind them one that
+// no pixel sees.
 inline const Splat* gather_splats(Frame& frame, const Tile& tile) {
-    Splat* copies = frame.tile_splats.data() + this_thread() * frame.longest_list;
+    Splat* copies = frame.tile_splats.data() + this_thread() * (frame.longest_list + 1);
     const Splat* splats = frame.splats.data();
     const uint32_t* list = frame.list_splats.data() + tile.first;
     for (uint32_t i = 0; i < tile.count; i++) copies[i] = splats[list[i]];
+    copies[tile.count] = {};
+    copies[tile.count].log2_opacity = -16.0f;
     return copies;
 }
 
@@ -157,7 +169,7 @@ inline void prepare_items(Frame& frame) {
     frame.transmittance.need(static_cast<size_t>(tiles) * BLOCKS * LANES);
     frame.block_items.need(static_cast<size_t>(tiles) * BLOCKS);
     frame.evaluated.need(tiles);
-    frame.tile_splats.need(frame.longest_list * frame.threads);
+    frame.tile_splats.need((frame.longest_list + 1) * frame.threads);
 }
 
 // Which Gaussians lie where.

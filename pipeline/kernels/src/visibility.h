@@ -33,6 +33,14 @@ inline void gather(const float* array, const uint32_t* ids, Vec* out) {
 struct Parameters16 {
     Vec mean[3], quat[4], log_scale[3], logit;
 };
+inline Parameters16 load_parameters(const GaussianArrays& gaussians, size_t first) {
+    Parameters16 p;
+    load_rows3(gaussians.means + 3 * first, p.mean);
+    load_rows4(gaussians.quats_wxyz + 4 * first, p.quat);
+    load_rows3(gaussians.log_scales + 3 * first, p.log_scale);
+    p.logit = load_unaligned(gaussians.opacity_logits + first);
+    return p;
+}
 inline Parameters16 gather_parameters(const GaussianArrays& gaussians, const uint32_t* ids) {
     Parameters16 p;
     gather<3>(gaussians.means, ids, p.mean);
@@ -48,11 +56,8 @@ struct Neighbors16 {
     Vec color[3];
     Neighbors16(const GaussianArrays& gaussians, size_t first) {
         if (first + LANES <= gaussians.count) {
-            load_rows3(gaussians.means + 3 * first, p.mean);
-            load_rows4(gaussians.quats_wxyz + 4 * first, p.quat);
-            load_rows3(gaussians.log_scales + 3 * first, p.log_scale);
+            p = load_parameters(gaussians, first);
             load_rows3(gaussians.colors + 3 * first, color);
-            p.logit = load_unaligned(gaussians.opacity_logits + first);
             return;
         }
         uint32_t ids[LANES];
