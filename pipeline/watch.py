@@ -44,7 +44,7 @@ class Watch:
         def report(part: str, done: int, total: int, shown: Shown | None) -> None:
             nonlocal told_s, last
             now = time.monotonic()
-            if now - told_s >= EVERY_S or part != last:
+            if now - told_s >= EVERY_S or part != last or done == total:
                 told_s, last = now, part
                 self.tell((robot, part, done, total))
             if show is not None:
