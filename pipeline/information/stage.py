@@ -71,19 +71,28 @@ def run_information(
 
         images = ShelvedList(map(posed, keyframes))
         camera = log.camera
-    images = without_moving(images, camera, moving)
-    views = MapViews(final.gaussians, camera, images, final.depth, threads)
+    views = MapViews(final.gaussians, camera, without_moving(images, camera, moving), final.depth, threads)
+    result = _information(views, final, config, thickness_floor_m)
+    del views, images  # a message is copied while it is written: nothing else may be in memory then
+    with LogWriter(out_path, robot=final.robot) as writer:
+        writer.write(topics.INFORMATION.of(final.robot), result, log_time_ns)
+    return result
+
+
+def _information(
+    views: MapViews, final: GaussianMap, config: InformationConfig, thickness_floor_m: float
+) -> GaussianInformation:
+    """The message; what it is computed from is freed."""
     noise, overlap = with_correlation(estimate_noise(views, config), views, config)
     sums = sum_information(views, noise, config)
     deviation_m = surface_deviation(views, config.deviation_gate_m)
-    informed = without_thickness(sums.geometry, final.gaussians, thickness_floor_m)
-    result = GaussianInformation(
+    return GaussianInformation(
         stamp_ns=final.stamp_ns,
         robot=final.robot,
         kind="gauss_newton",
         window=config.window if config.window == "all" else f"{config.window} {config.window_length}",
         ids=final.gaussians.ids,
-        geometry=informed.astype(np.float32),
+        geometry=without_thickness(sums.geometry, final.gaussians, thickness_floor_m, dtype=np.float32),
         color=sums.color.astype(np.float32),
         opacity=sums.opacity.astype(np.float32),
         observations=sums.observations,
@@ -94,9 +103,6 @@ def run_information(
         depth_pixels_per_sample=noise.depth_pixels,
         overlap=overlap,
     )
-    with LogWriter(out_path, robot=final.robot) as writer:
-        writer.write(topics.INFORMATION.of(final.robot), result, log_time_ns)
-    return result
 
 
 def read_frontend(path: Path) -> tuple[GaussianMap, list[Keyframe], int]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.geometry import so3, spd
@@ -52,16 +54,26 @@ def sum_information(views: MapViews, noise: ImageNoise, config: InformationConfi
 
 
 def without_thickness(
-    geometry: NDArray[np.float64], gaussians: Gaussians, floor_m: float
-) -> NDArray[np.float64]:
+    geometry: NDArray[np.float64],
+    gaussians: Gaussians,
+    floor_m: float,
+    *,
+    dtype: DTypeLike = np.float64,
+) -> NDArray[Any]:
     """Geometry information [n, 45] with the directions of scales at the floor taken out.
 
     A scale at the floor is held there by the map, not by the images. In the eigenbasis of log Sigma its direction is
     v = vec(e e^T), e the axis; F becomes P F P with P = 1 - v v^T on the covariance block: what is left is the
     information given the floor, and v itself has none. The tilt of a disc (e e_t^T + e_t e^T) keeps its information.
+
+    Args:
+        geometry: float64 [n, 45].
+        gaussians: whose it is.
+        floor_m: least standard deviation of the map.
+        dtype: of the result; what is computed is rounded to it at the end.
     """
     at_floor = gaussians.log_scales <= np.float32(np.log(floor_m) + FLOOR_TOLERANCE)
-    result = geometry.copy()
+    result = geometry.astype(dtype)
     rows = np.flatnonzero(at_floor.any(axis=1))
     for start in range(0, len(rows), _ROWS_AT_A_TIME):
         part = rows[start : start + _ROWS_AT_A_TIME]
