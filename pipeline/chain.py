@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, SupportsIndex
 
 from duagc.pipeline import steps
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.cache.carrier import Carried, Carrier
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.recording import RECORDING_FILE, Recording, read_log
@@ -101,6 +102,7 @@ class Chain:
         def inform(timing: Timing) -> None:
             settings = carrier.settings_of(stages.INFORMATION)
             with timing.stage(stages.INFORMATION, folder, name):
+                self._watch.tell((robot_of(name), "information", 0, 1))
                 steps.information(log, folder, settings, threads=threads)
 
         inputs = {"log": log_digest, "frontend": front.content(f"robots/{name}/frontend.mcap")}

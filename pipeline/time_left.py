@@ -21,7 +21,7 @@ from duagc.pipeline.runs import stages
 EVERY_S = 10.0
 KEYFRAMES_OF_FRAMES = 0.06
 """Until the keyframes of a robot are known."""
-UNHEARD = ("poses", "surface", "agreement")
+UNHEARD = ("poses", "information", "surface", "agreement")
 """Parts of a front end, and of an evaluation, that do not say how far they are."""
 PARTS = {"tracking again": "tracking", "keyframes": "poses"}
 """Parts of a front end that are not named as in `durations`."""
@@ -212,7 +212,7 @@ def _evaluation(robot: str, size: Size, team: Sequence[str]) -> dict[str, float]
 def _part_of(part: str) -> str:
     """The part of `durations` that a part of a front end belongs to."""
     last = part.rpartition(".")[2]
-    if last in GAUSSIANS or last == "model":
+    if last in (*GAUSSIANS, "model", "information"):
         return last
     return PARTS.get(part, "tracking" if part == "tracking" else "poses")
 

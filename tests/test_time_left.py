@@ -47,6 +47,7 @@ class Simulated:
             count = 0 if part == "start" else STEPS.get(part, 3)
             steps += [(at + took * (k + 1) / count, (robot, name, k + 1, count)) for k in range(count)]
             at += took
+        steps.append((at, (robot, "information", 0, 1)))
         at += inflation * durations.information_s(size)
         return [*steps, (at, (robot, "", 0, 0))]
 
@@ -123,6 +124,17 @@ def test_a_front_end_that_goes_on_is_not_taken_for_a_fast_one() -> None:
         resumed.now = durations.START_S + now - steps[190][0]
         resumed.times.step(*step)
     assert resumed.times.left_s() == pytest.approx(fresh.times.left_s(), rel=0.05)
+
+
+def test_an_information_that_takes_long_counts_for_nothing_else() -> None:
+    simulated = Simulated(2, 1, 1.0, 1.0)
+    for now, step in simulated.front_end("robot0", 0.0)[:-1]:
+        simulated.now = now
+        simulated.times.step(*step)
+    assert simulated.times._front.of["robot0"].now == ("information", simulated.now)
+    before = simulated.times.left_s()
+    simulated.now += 10 * durations.information_s(simulated.sizes["robot0"])
+    assert simulated.times.left_s() <= before
 
 
 def test_an_evaluation_that_is_slow_shows_while_it_is_at_work() -> None:
