@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -13,57 +14,74 @@ from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project, visible
-from duagc.pipeline.information.views import MapViews
+from duagc.pipeline.splat.gaussians import Gaussians
 
 Distances: TypeAlias = tuple[NDArray[np.int64], NDArray[np.float64]]
 MEDIAN_PX = 5
 NEAR_M = 0.05  # points closer to a camera than this are not judged by it
 
 
-def surface_deviation(views: MapViews, gate_m: float) -> NDArray[np.float64]:
+@dataclass(frozen=True)
+class DepthView:
+    """A depth image with the pose that it was taken from.
+
+    Attributes:
+        depth_m: float32 [H, W], meters, 0 where nothing was measured, or where it is not of the map.
+        T_map_camera: [4, 4].
+    """
+
+    depth_m: NDArray[np.float32]
+    T_map_camera: NDArray[np.float64]
+
+
+def surface_deviation(
+    gaussians: Gaussians, camera: PinholeCamera, views: Iterable[DepthView], gate_m: float
+) -> NDArray[np.float64]:
     """How far every Gaussian's mean is from the surface that the depth images show, meters [n].
 
     Overlapping splats compensate for each other's positions: where their sum is drawn to a millimeter, each may be a
-    centimeter off, and no pixel shows it. The depth image does: the deviation is the median, over the views that
-    measured a surface within the gate, of the mean's distance from the tangent plane at its pixel (of the depth's
-    median over 5 x 5 px, or the sensor's noise would pass for the map's deviation). Not the root mean square: at an
-    edge some views look past a Gaussian at another surface. The median over all Gaussians counts as half a view more; a
-    Gaussian that no view measured has the gate.
+    centimeter off, and no pixel shows it. Depth images do: a view measures the signed distance of the mean from the
+    tangent plane at its pixel (of the depth's median over 5 x 5 px). The median over all views that measured a surface
+    within the gate is what is left of it when the noise of the sensor is averaged out; not the mean, because at an edge
+    some views look past a Gaussian at another surface. What no view shows, because neighbors or all views share it,
+    counts as half of what is typical: of the median of these distances over all Gaussians. A Gaussian that no view
+    measured has the gate.
 
     Args:
-        views: the map and its images.
+        gaussians: of a map.
+        camera: of the views.
+        views: of the robot that made the map, in its frame; the more, the less noise is left.
         gate_m: a surface farther than this from a Gaussian belongs to another one.
     """
-    near = ShelvedList(_near_surfaces(views, gate_m))
-    n = len(views.gaussians)
-    count, median = np.zeros(n, np.int64), np.zeros(n)
+    near = ShelvedList(_near_surfaces(gaussians, camera, views, gate_m))
+    n = len(gaussians)
+    measured, off_m = np.zeros(n, bool), np.zeros(n)
     for block in row_blocks(n):
-        count[block], median[block] = _medians(near, block)
-    measured = count > 0
+        measured[block], off_m[block] = _medians(near, block)
     deviation_m = np.full(n, gate_m)
     if measured.any():
-        views_of, median = count[measured], median[measured]
-        typical = np.median(median)
-        deviation_m[measured] = np.sqrt((views_of * median**2 + 0.5 * typical**2) / (views_of + 0.5))
+        typical_m = np.median(np.abs(off_m[measured]))
+        deviation_m[measured] = np.hypot(off_m[measured], 0.5 * typical_m)
     return deviation_m
 
 
-def _near_surfaces(views: MapViews, gate_m: float) -> Iterator[Distances]:
-    """Of every view the rows of the Gaussians near a surface that it measured, ascending, and their distances."""
+def _near_surfaces(
+    gaussians: Gaussians, camera: PinholeCamera, views: Iterable[DepthView], gate_m: float
+) -> Iterator[Distances]:
+    """Of every view the rows of the Gaussians near a surface that it measured, ascending, and signed distances."""
     import cv2
 
-    means = views.gaussians.means.astype(np.float64)
-    for image in views.images:
-        usable = image.depth_m if image.mask is None else np.where(image.mask, image.depth_m, np.float32(0))
-        smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(usable), MEDIAN_PX), dtype=np.float32)
-        points = se3.transform(se3.inverse(image.T_world_camera), means)
-        rows, distance_m = _from_tangent_planes(points, smooth, views.camera)
+    means = gaussians.means.astype(np.float64)
+    for view in views:
+        smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(view.depth_m), MEDIAN_PX), dtype=np.float32)
+        points = se3.transform(se3.inverse(view.T_map_camera), means)
+        rows, distance_m = _from_tangent_planes(points, smooth, camera)
         near = np.abs(distance_m) < gate_m
-        yield rows[near], np.abs(distance_m[near])
+        yield rows[near], distance_m[near]
 
 
-def _medians(near: Sequence[Distances], block: slice) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """How many views measured a surface near each Gaussian of some rows, and the median of its distances there."""
+def _medians(near: Sequence[Distances], block: slice) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Whether a view measured a surface near each Gaussian of some rows, and the median of its signed distances."""
     all_rows, all_distances = [np.zeros(0, np.int64)], [np.zeros(0)]
     for rows, distance_m in near:
         part = slice(*np.searchsorted(rows, (block.start, block.stop)))
@@ -75,8 +93,9 @@ def _medians(near: Sequence[Distances], block: slice) -> tuple[NDArray[np.int64]
     median = np.zeros(len(count))
     measured = count > 0
     first = (np.cumsum(count) - count)[measured]
-    median[measured] = distance_m[first + (count[measured] - 1) // 2]
-    return count, median
+    lower, upper = (distance_m[first + (count[measured] - k) // 2] for k in (1, 0))
+    median[measured] = 0.5 * (lower + upper)
+    return measured, median
 
 
 def _from_tangent_planes(

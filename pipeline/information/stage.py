@@ -6,10 +6,14 @@ information.mcap. Source: method section 1 and 2, paper eq. (2)-(4) with J^T R^-
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import SupportsIndex
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
@@ -17,12 +21,14 @@ from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.information.deviation import surface_deviation
+from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.information.deviation import DepthView, surface_deviation
 from duagc.pipeline.information.noise import estimate_noise, with_correlation
 from duagc.pipeline.information.sums import sum_information, without_thickness
-from duagc.pipeline.information.views import MapViews, without_moving
+from duagc.pipeline.information.views import MapViews, free_space, usable_depth, without_moving
 from duagc.pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
-from duagc.pipeline.recording import LogWriter, open_rgbd, read_exposures, read_log
+from duagc.pipeline.recording import LogWriter, RgbdLog, open_rgbd, read_exposures, read_log
+from duagc.pipeline.registration.moving import FreeSpace
 from duagc.schemas import topics
 
 
@@ -51,7 +57,8 @@ def run_information(
     Raises:
         DuagError: no map in the front end's log, or a keyframe that is held out or not in the sensor log.
     """
-    final, keyframes, log_time_ns = read_frontend(frontend_path)
+    front = read_frontend(frontend_path)
+    final, keyframes = front.final, front.keyframes
     with open_rgbd(log_path) as log:
         if log.robot != robot_of(final.robot):
             raise DuagError(f"{frontend_path}: has the map of {final.robot}, expected that of {log.robot}")
@@ -70,22 +77,32 @@ def run_information(
             return PosedRgbd(frame.color, frame.depth, T, frame.mask, frame.depth_sigma, exposure)
 
         images = ShelvedList(map(posed, keyframes))
-        camera = log.camera
-    views = MapViews(final.gaussians, camera, without_moving(images, camera, moving), final.depth, threads)
-    result = _information(views, final, config, thickness_floor_m)
-    del views, images  # a message is copied while it is written: nothing else may be in memory then
+        free = free_space(images, log.camera, moving)
+        views = MapViews(final.gaussians, log.camera, without_moving(images, free), final.depth, threads)
+        seen = chain(
+            (DepthView(usable_depth(image), image.T_world_camera) for image in views.images),
+            _depth_views(log, front.between(config.deviation_frames), free),
+        )
+        deviation_m = surface_deviation(final.gaussians, log.camera, seen, config.deviation_gate_m)
+    result = _information(views, final, config, thickness_floor_m=thickness_floor_m, deviation_m=deviation_m)
+    # a message is copied while it is written: nothing else may be in memory then
+    del views, images, free, seen
     with LogWriter(out_path, robot=final.robot) as writer:
-        writer.write(topics.INFORMATION.of(final.robot), result, log_time_ns)
+        writer.write(topics.INFORMATION.of(final.robot), result, front.log_time_ns)
     return result
 
 
 def _information(
-    views: MapViews, final: GaussianMap, config: InformationConfig, thickness_floor_m: float
+    views: MapViews,
+    final: GaussianMap,
+    config: InformationConfig,
+    *,
+    thickness_floor_m: float,
+    deviation_m: NDArray[np.float64],
 ) -> GaussianInformation:
     """The message; what it is computed from is freed."""
     noise, overlap = with_correlation(estimate_noise(views, config), views, config)
     sums = sum_information(views, noise, config)
-    deviation_m = surface_deviation(views, config.deviation_gate_m)
     return GaussianInformation(
         stamp_ns=final.stamp_ns,
         robot=final.robot,
@@ -105,8 +122,37 @@ def _information(
     )
 
 
-def read_frontend(path: Path) -> tuple[GaussianMap, list[Keyframe], int]:
-    """The last map of a front end's log, the last message of every keyframe in order, and the log time of the map.
+@dataclass(frozen=True)
+class FrontEnd:
+    """What a front end ended with.
+
+    Attributes:
+        final: its last map.
+        log_time_ns: of that.
+        keyframes: the last message of each, in order.
+        others: other frames that were tracked, in order; none is held out.
+    """
+
+    final: GaussianMap
+    log_time_ns: int
+    keyframes: list[Keyframe]
+    others: list[Odometry]
+
+    def between(self, most: int) -> list[Odometry]:
+        """At most so many of the other frames, evenly spread."""
+        total = len(self.others)
+        return [self.others[k] for k in evenly_spaced(total, min(most, total))]
+
+
+def _depth_views(log: RgbdLog, frames: Sequence[Odometry], free: FreeSpace) -> Iterator[DepthView]:
+    for odometry in frames:
+        depth_m, T_map_camera = log.frame(odometry.frame_index).usable_depth, odometry.T_map_camera
+        still = free.usable(depth_m, T_map_camera, None)
+        yield DepthView(depth_m if still is None else np.where(still, depth_m, np.float32(0)), T_map_camera)
+
+
+def read_frontend(path: Path) -> FrontEnd:
+    """What the log of a front end has of its end.
 
     Raises:
         DuagError: no map, or a keyframe whose frame is held out for evaluation.
@@ -114,7 +160,7 @@ def read_frontend(path: Path) -> tuple[GaussianMap, list[Keyframe], int]:
     final: GaussianMap | None = None
     log_time_ns = 0
     keyframes: dict[int, Keyframe] = {}
-    held_out: set[int] = set()
+    frames: dict[int, Odometry] = {}
     for record in read_log(path, (topics.MAP, topics.KEYFRAME, topics.ODOMETRY)):
         row = topics.find(record.topic)
         if row is None:
@@ -126,17 +172,18 @@ def read_frontend(path: Path) -> tuple[GaussianMap, list[Keyframe], int]:
             keyframes[keyframe.keyframe_index] = keyframe
         elif row[0] is topics.ODOMETRY:
             odometry: Odometry = record.message()
-            if odometry.held_out:
-                held_out.add(odometry.frame_index)
+            frames[odometry.frame_index] = odometry
     if final is None:
         raise DuagError(
             f"{path}: {topics.MAP.pattern} has no message, expected the map of a finished front end"
         )
     ordered = [keyframes[index] for index in sorted(keyframes)]
     for keyframe in ordered:
-        if keyframe.frame_index in held_out:
+        at = frames.pop(keyframe.frame_index, None)
+        if at is not None and at.held_out:
             raise DuagError(
                 f"{path}: {topics.KEYFRAME.of(keyframe.robot)} has frame {keyframe.frame_index}, "
                 "expected no frame that is held out for evaluation"
             )
-    return final, ordered, log_time_ns
+    others = [f for _, f in sorted(frames.items()) if f.status != "lost" and not f.held_out]
+    return FrontEnd(final, log_time_ns, ordered, others)

@@ -10,7 +10,7 @@ from duagc.pipeline.base import row_blocks
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.information.deviation import surface_deviation
+from duagc.pipeline.information.deviation import DepthView, surface_deviation
 from duagc.pipeline.information.noise import ImageNoise, estimate_noise, with_correlation
 from duagc.pipeline.information.sums import sum_information
 from duagc.pipeline.information.views import MapViews
@@ -114,23 +114,46 @@ def test_the_deviation_is_the_distance_from_the_measured_surface() -> None:
         np.arange(n), np.zeros(n), means, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), -4.0), np.zeros((n, 3)),
         np.zeros(n),
     )  # fmt: skip
-    view = PosedRgbd(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), depth, np.eye(4))
-    found = surface_deviation(MapViews(gaussians, CAMERA, [view] * 1000), 0.1)
-    np.testing.assert_allclose(found[:3], np.abs(off_m[:3]), atol=1e-3)
-    np.testing.assert_array_equal(found[3:], 0.1)  # not measured within the gate
-    half = surface_deviation(MapViews(gaussians, CAMERA, [view]), 0.1)  # and it counts as half a view
-    np.testing.assert_allclose(half[1:3] ** 2, (off_m[1:3] ** 2 + 0.5 * 0.02**2) / 1.5, rtol=0.05)
-    other = PosedRgbd(view.color, (depth + 0.04).astype(np.float32), np.eye(4))  # two of five look past it
-    past = surface_deviation(MapViews(gaussians, CAMERA, [*[view] * 300, *[other] * 200]), 0.1)
-    np.testing.assert_allclose(past[:3], np.abs(off_m[:3]), atol=1e-3)
-    blind = PosedRgbd(view.color, view.depth_m, view.T_world_camera, np.zeros(depth.shape, bool))
-    np.testing.assert_array_equal(surface_deviation(MapViews(gaussians, CAMERA, [blind]), 0.1), 0.1)
+    view = DepthView(depth, np.eye(4))
+
+    def found(*views: DepthView) -> np.ndarray:
+        return surface_deviation(gaussians, CAMERA, views, 0.1)
+
+    alone = found(view)
+    np.testing.assert_allclose(
+        alone[:3], np.hypot(off_m[:3], 0.01), atol=1e-3
+    )  # half of what is typical counts too
+    np.testing.assert_array_equal(alone[3:], 0.1)  # not measured within the gate
+    past = DepthView(depth + np.float32(0.04), np.eye(4))  # two of five look past it
+    np.testing.assert_allclose(found(*[view] * 3, *[past] * 2)[:3], alone[:3], atol=1e-3)
+    np.testing.assert_array_equal(found(DepthView(np.zeros_like(depth), np.eye(4))), 0.1)
+    assert np.array_equal(found(), np.full(n, 0.1))
+
+
+def test_the_noise_of_views_is_no_deviation() -> None:
+    """A map whose Gaussians are 0 to 20 mm before and behind a wall, seen with noise of 60 mm that a view shares."""
+    wall_z, off_m = 2.0, np.linspace(-0.02, 0.02, 41)
+    x = np.linspace(-0.8, 0.8, 41)
+    n = len(x)
+    gaussians = Gaussians(
+        np.arange(n), np.zeros(n), np.column_stack([x, 0 * x, wall_z + off_m]), np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.full((n, 3), -4.0), np.zeros((n, 3)), np.zeros(n),
+    )  # fmt: skip
+    flat = np.full((CAMERA.height, CAMERA.width), wall_z, np.float32)
+    noise_m = np.roll(np.linspace(-0.06, 0.06, 41), 10)  # 31 mm too far at first
+    views = [DepthView(flat + np.float32(x), np.eye(4)) for x in noise_m]
+    right_m = np.hypot(off_m, 0.005)
+    errors_m = [
+        np.abs(surface_deviation(gaussians, CAMERA, views[:count], 0.2) - right_m).max() for count in (1, 41)
+    ]
+    assert errors_m[0] > 0.02
+    assert errors_m[1] < 0.002
 
 
 def test_the_deviation_is_found_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     gaussians = wall()
-    views = MapViews(gaussians, CAMERA, views_of(gaussians, depth_factor=1.0))
-    whole = surface_deviation(views, 0.1)
+    views = [DepthView(v.depth_m, v.T_world_camera) for v in views_of(gaussians, depth_factor=1.0)]
+    whole = surface_deviation(gaussians, CAMERA, views, 0.1)
     assert len(np.unique(whole)) > 200
     monkeypatch.setattr(row_blocks, "ROWS", 100)
-    assert np.array_equal(surface_deviation(views, 0.1), whole)
+    assert np.array_equal(surface_deviation(gaussians, CAMERA, views, 0.1), whole)

@@ -92,6 +92,24 @@ def test_held_out_frames_never_enter(tmp_path: Path) -> None:
     assert not (tmp_path / "out.mcap").exists()
 
 
+@pytest.mark.parametrize(("frames", "held_out"), [(4, (1,)), (4, (1, 2)), (0, (1,))])
+def test_other_frames_show_the_deviation_unless_they_are_held_out(
+    tmp_path: Path, frames: int, held_out: tuple[int, ...]
+) -> None:
+    def deviation_m(name: str, held_out: tuple[int, ...], frames: int) -> np.ndarray:
+        folder = tmp_path / name
+        folder.mkdir()
+        write_logs(folder, held_out=held_out, keyframes=(0, 3))
+        config = InformationConfig(deviation_frames=frames)
+        paths = [folder / file for file in ("alpha.mcap", "frontend.mcap", "information.mcap")]
+        settings = {"moving": MovingConfig(), "thickness_floor_m": THICKNESS_FLOOR_M}
+        return run_information(*paths, config=config, **settings).deviation_m
+
+    keyframes_alone = deviation_m("alone", (1, 2), 0)
+    takes_part = frames > 0 and 2 not in held_out
+    assert np.array_equal(deviation_m("asked", held_out, frames), keyframes_alone) == (not takes_part)
+
+
 def test_a_front_end_without_a_map_is_one_line(tmp_path: Path) -> None:
     write_logs(tmp_path)
     with LogWriter(tmp_path / "unfinished.mcap", "alpha"):

@@ -12,7 +12,7 @@ from duagc.pipeline.geometry import so3, spd
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.information.noise import ImageNoise, estimate_noise
 from duagc.pipeline.information.sums import sum_information, without_thickness
-from duagc.pipeline.information.views import MapViews, without_moving
+from duagc.pipeline.information.views import MapViews, free_space, without_moving
 from duagc.pipeline.kernels import FisherSums
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import pack_geometry, unpack_geometry
@@ -142,13 +142,13 @@ def test_what_moved_is_in_no_sum() -> None:
         card[8:24, 2 + 11 * k : 12 + 11 * k] = 1.0
         crossed.append(PosedRgbd(color, card, T))
     config = MovingConfig(halvings=1, grow_px=4)
-    assert all(view.mask is None for view in without_moving(plain, CAMERA, config))
-    masked = without_moving(crossed, CAMERA, config)
+    assert all(view.mask is None for view in without_moving(plain, free_space(plain, CAMERA, config)))
+    masked = without_moving(crossed, free_space(crossed, CAMERA, config))
     for view in masked:
         assert view.mask is not None
         assert view.mask[view.depth_m < 1.5].mean() < 0.05
         assert view.mask.mean() > 0.7
-    assert list(without_moving(crossed, CAMERA, MovingConfig(enabled=False))) == crossed
+    assert list(without_moving(crossed, free_space(crossed, CAMERA, MovingConfig(enabled=False)))) == crossed
     less = sum_information(MapViews(gaussians, CAMERA, masked), NOISE, InformationConfig())
     more = sum_information(MapViews(gaussians, CAMERA, crossed), NOISE, InformationConfig())
     assert less.weight.sum() < 0.95 * more.weight.sum()
