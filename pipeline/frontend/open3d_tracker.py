@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.open3d_import import import_open3d
@@ -204,7 +205,7 @@ class Open3dTracker(OtherTracker):
     def _extrinsics(self, T_map_camera: Array) -> Any:
         return self._tensor(se3.inverse(T_map_camera))
 
-    def _tensor(self, array: Array) -> Any:
+    def _tensor(self, array: NDArray[Any]) -> Any:
         return self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
 
 

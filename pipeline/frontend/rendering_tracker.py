@@ -10,7 +10,7 @@ pyramid nor a test of whether the pose can be true.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +90,12 @@ class PoseFit:
     """Finds where a camera sees a map as in its images, by gradient steps."""
 
     def __init__(
-        self, camera: PinholeCamera, config: RenderingTrackerConfig, loss: LossWeights, *, threads: int = 1
+        self,
+        camera: PinholeCamera,
+        config: RenderingTrackerConfig,
+        loss: LossWeights,
+        *,
+        threads: SupportsIndex = 1,
     ) -> None:
         """Set up.
 
@@ -196,7 +201,7 @@ class RenderingTracker(OtherTracker):
         read: ReadFrame,
         *,
         seed: int = 0,
-        threads: int = 1,
+        threads: SupportsIndex = 1,
     ) -> None:
         """Begin without a keyframe.
 

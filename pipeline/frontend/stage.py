@@ -166,7 +166,7 @@ class _Tracking:
     motion: MotionPrior | None
     checkpoints: Checkpoints
     seed: int
-    threads: int
+    threads: SupportsIndex
     progress: bool
 
     def run(self) -> TrackedLog:
