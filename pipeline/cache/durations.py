@@ -11,6 +11,7 @@ import heapq
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
+from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.mapping import MappingConfig
 
 Size = Mapping[str, int]
@@ -25,8 +26,8 @@ FINAL_S = (0.0032, 0.087)
 """The same of a step of the final optimization."""
 START_S = 2.0
 """Of a process."""
-INFORMATION_S = 0.020
-"""Of a frame, for every million pixels."""
+INFORMATION_S, DEVIATION_S = 0.020, 0.10
+"""Of a frame, and of one that shows how far Gaussians are from the surface, for every million pixels."""
 FUSION_S = 1.0
 """Of a robot that has peers."""
 FUSED_VIEW_S = (0.085, 1.00)
@@ -88,7 +89,8 @@ def information_s(size: Size) -> float:
     Args:
         size: of its log.
     """
-    return INFORMATION_S * size["pixels"] * 1e-6 * size["frames"]
+    shown = min(size["frames"], InformationConfig().deviation_frames)
+    return size["pixels"] * 1e-6 * (INFORMATION_S * size["frames"] + DEVIATION_S * shown)
 
 
 def fusion_s(size: Size) -> float:
