@@ -1,7 +1,8 @@
 """The information stage: Gauss-Newton Fisher sums of one robot's final map over its own keyframes.
 
-Reads the robot's log (images of keyframes only; held-out frames are never decoded) and its frontend.mcap, writes
-information.mcap. Source: method section 1 and 2, paper eq. (2)-(4) with J^T R^-1 J in place of squared gradients.
+Reads the robot's log (keyframes and some frames between them; held-out frames are never decoded) and its
+frontend.mcap, writes information.mcap. Source: method section 1 and 2, paper eq. (2)-(4) with J^T R^-1 J in place of
+squared gradients.
 """
 
 from __future__ import annotations
