@@ -117,6 +117,23 @@ def test_killed_in_any_tile_of_the_map_it_ends_with_the_same_bits(log: Path, tmp
         assert len({line for line in runs.said if line.startswith(f"{part}: goes on")}) >= least, runs.said
 
 
+def test_killed_while_tracking_by_rendering_it_ends_with_the_same_bits(log: Path, tmp_path: Path) -> None:
+    """The map that frames are tracked by is made again from the images of its keyframes."""
+    settings = (
+        "frontend.tracking.method=rendering",
+        "frontend.tracking.strides=[2, 1, 1, 1]",
+        "frontend.tracking.rendering.steps=8",
+        "frontend.tracking.rendering.keyframe_steps=6",
+        "frontend.keyframes.max_rotation_rad=0.03",  # some keyframes
+        "frontend.mapping_enabled=false",
+    )
+    config = load_config(RunConfig, overrides=settings).frontend
+    digest, _ = undisturbed(log, config, tmp_path)
+    runs = Runs(log, tmp_path, config)
+    assert runs.until_done(5) == digest
+    assert {"tracking: goes on at 5/14", "tracking: goes on at 10/14"} <= set(runs.said), runs.said
+
+
 def test_what_is_damaged_is_named_and_computed_again(
     log: Path, expected: tuple[str, int], tmp_path: Path
 ) -> None:
