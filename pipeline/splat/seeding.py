@@ -208,6 +208,16 @@ def _cells(image: NDArray, side: int) -> NDArray:
     return pixels_first.reshape(side * side, rows * columns, *tail)
 
 
+def _pixels_of(cells: NDArray[np.int64], image: NDArray, side: int) -> NDArray:
+    """`_cells(image, side)[:, cells]`, with the same order in memory: few cells are filled, and an image is large."""
+    overhang = [(0, -length % side) for length in image.shape[:2]]
+    if any(after for _, after in overhang):
+        image = np.pad(image, [*overhang, *[(0, 0)] * (image.ndim - 2)])
+    row, column = np.divmod(cells[:, None], image.shape[1] // side)
+    pixel = np.arange(side * side)
+    return image[side * row + pixel // side, side * column + pixel % side].swapaxes(0, 1)
+
+
 def _grid(color: Image, depth_m: Image, wanted: NDArray[np.bool_], side: int) -> _Grid:
     """Only filled cells are measured: the others are split whatever they hold."""
     rows, columns = -(-depth_m.shape[0] // side), -(-depth_m.shape[1] // side)
@@ -215,8 +225,8 @@ def _grid(color: Image, depth_m: Image, wanted: NDArray[np.bool_], side: int) ->
     filled = mask.sum(axis=0) * 2 >= side * side
     cells = np.flatnonzero(filled)
     mask = mask[:, cells]
-    z = _cells(depth_m, side)[:, cells].astype(np.float64)
-    rgb = _cells(color, side)[:, cells].astype(np.float64)
+    z = _pixels_of(cells, depth_m, side).astype(np.float64)
+    rgb = _pixels_of(cells, color, side).astype(np.float64)
     nearest = np.where(mask, z, np.inf).min(axis=0)
     farthest = np.where(mask, z, -np.inf).max(axis=0)
     front = mask & (z <= 1.05 * nearest)

@@ -7,6 +7,7 @@ from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M, SeedingConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer, Render
+from duagc.pipeline.splat import seeding
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.seeding import seed_discs, unexplained
 
@@ -104,3 +105,16 @@ def test_a_seeded_view_is_explained_and_a_changed_one_is_not() -> None:
     assert unexplained(render, painted, depth, SeedingConfig())[21:29, 21:29].all()
     empty = Render(np.zeros_like(color), np.zeros_like(depth), np.zeros_like(depth))
     assert unexplained(empty, color, depth, SeedingConfig()).all()
+
+
+@pytest.mark.parametrize("side", [8, 2])
+@pytest.mark.parametrize("shape", [(24, 40), (13, 21, 3), (5, 3)])
+def test_pixels_of_some_cells_are_those_of_all(shape, side):
+    """In the same order in memory too, by which sums over a cell round."""
+    rng = np.random.default_rng(0)
+    image = rng.random(shape).astype(np.float32)
+    every = seeding._cells(image, side)
+    cells = np.flatnonzero(rng.random(every.shape[1]) < 0.5)
+    found, wanted = seeding._pixels_of(cells, image, side), every[:, cells]
+    np.testing.assert_array_equal(found, wanted)
+    assert found.strides == wanted.strides
