@@ -162,6 +162,7 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
     uint64_t evaluated = 0;
     for (int b = 0; b < BLOCKS; b++) {
         fetch_ahead(frame, index + 1, b, loss);
+        if constexpr (D != Derivatives::NONE) sweep.template fetch_rows<ROW_OF<D, KIND>>(frame, b);
         const Block block(sweep.tile, b, view);
         sweep.items.counts[b] = 0;
         if (block.outside(view)) continue;
