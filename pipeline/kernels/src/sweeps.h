@@ -31,7 +31,7 @@ template <int ROW>
 inline void prepare_rows(Frame& frame) {
     const size_t count = (frame.one_row ? frame.visible : frame.intersection_count) * ROW;
     frame.rows.need(count);
-    if (frame.one_row) std::memset(frame.rows.data(), 0, count * sizeof(float));
+    if (frame.one_row && count) std::memset(frame.rows.data(), 0, count * sizeof(float));
     frame.tile_rows.need(frame.longest_list * ROW * frame.threads);
 }
 
