@@ -170,7 +170,7 @@ class _Tracking:
     progress: bool
 
     def run(self) -> TrackedLog:
-        """Track; where color and depth are of different times, again with depth moved by the first result."""
+        """Track; where depth or rows are of other times, again with them moved by the first result."""
         log, save = self.log, self.checkpoints
         first = save.done("tracked first", lambda: self._frames("tracking"))
         if delay_ns := save.done("delay", lambda: self._delay_ns(first)):
@@ -194,7 +194,7 @@ class _Tracking:
         return certain_delay_ns(self.log, _trajectories(tracked), self.config.delay)
 
     def _again(self, tracked: TrackedLog) -> TrackedLog:
-        if self.log.pairing.largest_offset_ns and tracked.submaps[0].keyframes:
+        if self.log.needs_motion and tracked.submaps[0].keyframes:
             self.log.move_depth(*_trajectories(tracked))
             return self._frames("tracking again")
         return tracked

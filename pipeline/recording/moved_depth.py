@@ -55,15 +55,28 @@ class DepthMotion:
         Returns:
             The motion; None where the poses do not say.
         """
+        found = self.at(color_ns, np.array([depth_ns], dtype=np.int64))
+        return None if found is None else found[0]
+
+    def at(self, color_ns: int, times_ns: NDArray[np.int64]) -> Array | None:
+        """T_color_then [n, 4, 4], from the camera at some times to the camera when a color image was taken.
+
+        Args:
+            color_ns: time of a frame.
+            times_ns: [n], near it.
+
+        Returns:
+            The motions; None where the poses do not say.
+        """
         for part in self._parts:
             at = int(np.searchsorted(part.stamps_ns, color_ns))
             if at < len(part.stamps_ns) and part.stamps_ns[at] == color_ns:
-                return _motion_in(part, at, depth_ns - color_ns)
+                return _motion_in(part, at, times_ns - color_ns)
         return None
 
 
-def _motion_in(part: Trajectory, at: int, duration_ns: int) -> Array | None:
-    """Motion [4, 4] of the camera in some time from a frame; None without other frames near it."""
+def _motion_in(part: Trajectory, at: int, durations_ns: NDArray[np.int64]) -> Array | None:
+    """Motions [n, 4, 4] of the camera in some times from a frame; None without other frames near it."""
     offsets_ns = part.stamps_ns - part.stamps_ns[at]
     near = np.flatnonzero(np.abs(offsets_ns) <= REACH_NS)
     first = max(int(np.searchsorted(near, at)) - FRAMES_AROUND, 0)
@@ -75,8 +88,8 @@ def _motion_in(part: Trajectory, at: int, duration_ns: int) -> Array | None:
     motions = se3.log(se3.inverse(part.poses[at]) @ part.poses[chosen])
     degree = 2 if len(chosen) > 3 else 1
     curve = np.linalg.lstsq(np.vander(seconds, degree + 1), motions, rcond=None)[0]
-    then, now = np.vander(np.array([1e-9 * duration_ns, 0.0]), degree + 1) @ curve
-    return np.asarray(se3.inverse(se3.exp(now)) @ se3.exp(then))
+    then = np.vander(1e-9 * durations_ns, degree + 1) @ curve
+    return np.asarray(se3.inverse(se3.exp(curve[-1])) @ se3.exp(then))
 
 
 def depth_delay_ns(frontend: Path) -> int:

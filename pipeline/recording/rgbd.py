@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
-from duagc.pipeline.geometry import masks
+from duagc.pipeline.geometry import masks, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.depth_sources import DepthImage, check_size, constant, depth_source
 from duagc.pipeline.recording.motion import MotionPrior, motion_prior
 from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, move_depth, tracked_frames
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
-from duagc.pipeline.recording.read import LogFile, Record
+from duagc.pipeline.recording.read import LOG_RECORD, LogFile, Record
+from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, row_times_ns
 from duagc.schemas import topics as topic_table
 
 
@@ -60,7 +61,7 @@ class RgbdLog:
     to all of them.
 
     `robot`, `camera`, `depth_scale` (meters per unit), `valid` (bool [H, W], pixels that show the scene; None = all),
-    `depth_delay_ns` (of `delay_depth`).
+    `depth_delay_ns` (of `delay_depth`), `readout` (how long images are read, as the log states it).
     Reads what is asked for and keeps no more than a few frames.
     """
 
@@ -100,7 +101,10 @@ class RgbdLog:
         self._depth_at = self._log.entries_by_time(self._source.topic)
         self.pairing = pair(self._color_at, self._depth_at)
         self.depth_delay_ns = 0
-        self._depth_motion: DepthMotion | None = None
+        stated = Readout.stated(dict(self._log.metadata()).get(LOG_RECORD, {}), str(self.path))
+        registered = self._source.topic == topic_table.DEPTH.of(self.robot)
+        self.readout = stated if registered else replace(stated, depth_s=0.0)
+        self._motion: DepthMotion | None = None
         if not len(self.pairing.offsets_ns):
             raise DuagError(
                 f"{self.path}: {self._color_topic} has {len(self._color_at)} images and {self._source.topic} "
@@ -185,23 +189,28 @@ class RgbdLog:
         color, depth = self.pairing.pairs[index]
         return 0 if depth is None else depth - color
 
+    @property
+    def needs_motion(self) -> bool:
+        """Whether some depth, or some row, is of another time than its color."""
+        return bool(self.pairing.largest_offset_ns) or self.readout.rolls
+
     def move_depth(self, *parts: Trajectory) -> None:
-        """Move depth of another time than its color into the time of the color, in all frames read from now on.
+        """Move depth and rows of another time than their color's into that time, in all frames read from now on.
 
         Args:
             parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
         """
-        if self.pairing.largest_offset_ns:
-            self._depth_motion = DepthMotion(*parts)
+        if self.needs_motion:
+            self._motion = DepthMotion(*parts)
 
     def move_depth_by(self, frontend: Path) -> None:
         """`delay_depth` and `move_depth` by what the front end found.
 
         Args:
-            frontend: frontend.mcap of the robot; poses are read only if some depth is of another time.
+            frontend: frontend.mcap of the robot; poses are read only if some depth or row is of another time.
         """
         self.delay_depth(depth_delay_ns(frontend))
-        if self.pairing.largest_offset_ns:
+        if self.needs_motion:
             self.move_depth(tracked_frames(frontend))
 
     def motion_prior(self) -> MotionPrior | None:
@@ -229,6 +238,8 @@ class RgbdLog:
         color = self._log.record_at(self._color_topic, self._color_at[stamp])
         image, mask = self._decode_color(color), self._mask_of(stamp)
         found, moved = self._depth_of(stamp, depth_stamp)
+        if (still := self._unrolling(stamp, stamp, self.readout.color_s, found)) is not None:
+            image, mask = still.color(image), still.usable(mask)
         return RgbdFrame(
             index,
             stamp,
@@ -245,13 +256,31 @@ class RgbdLog:
         if depth_ns is None:
             return DepthImage(np.zeros((self.camera.height, self.camera.width), dtype=np.float32)), False
         found = self._source.read(self._log.record_at(self._source.topic, self._depth_at[depth_ns]))
-        if depth_ns == color_ns or self._depth_motion is None:
+        if self._motion is None:
             return found, False
-        T_color_depth = self._depth_motion.between(color_ns, depth_ns)
+        if (still := self._unrolling(color_ns, depth_ns, self.readout.depth_s, found)) is not None:
+            found = still.depth(DepthImage(self._of_scene(found.depth_m), found.sigma_m))
+        if depth_ns == color_ns:
+            return found, still is not None
+        T_color_depth = self._motion.between(color_ns, depth_ns)
         if T_color_depth is None:
             return found, False
         seen = DepthImage(self._of_scene(found.depth_m), found.sigma_m)
         return move_depth(seen, self.camera, T_color_depth), True
+
+    def _unrolling(
+        self, color_ns: int, taken_ns: int, readout_s: float, depth: DepthImage
+    ) -> Unrolling | None:
+        """How an image that was read around a time is made still; None where it is, or no pose says how it moved."""
+        if self._motion is None or readout_s == 0:
+            return None
+        rows_ns = taken_ns + row_times_ns(self.camera.height, readout_s)
+        T_color_then = self._motion.at(color_ns, np.append(rows_ns, taken_ns))
+        if T_color_then is None:
+            return None
+        T_middle_row = se3.inverse(T_color_then[-1]) @ T_color_then[:-1]
+        found = Unrolling(self.camera, T_middle_row, depth.depth_m)
+        return found if found.is_needed else None
 
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [H, W] with 0 where the camera never shows the scene."""

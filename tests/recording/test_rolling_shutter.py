@@ -1,0 +1,128 @@
+"""Rows that were read one after the other, put where a still camera has them."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.recording.depth_sources import DepthImage
+from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, row_times_ns
+
+CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 79.5, 59.5)
+TWIST = np.array([0.4, -0.2, 0.3, 0.5, 1.2, -0.4])  # m/s and rad/s, of a hasty hand
+READOUT_S = 0.03
+SCALE_M = 0.0002
+
+
+def shot(T_world_row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Color and depth of a slanted wall; T_world_row: [h, 4, 4], where the camera was at each row."""
+    rays = np.einsum("vij,vuj->vui", T_world_row[:, :3, :3], CAMERA.rays())
+    normal, origin = np.array([0.3, 0.1, -1.0]), T_world_row[:, None, :3, 3]
+    z = (-2.0 - origin @ normal) / (rays @ normal)
+    at = origin + rays * z[..., None]
+    waves = at @ np.array([[6.0, 1.0, 4.0], [1.0, 7.0, -4.0], [0.0, 0.0, 0.0]])
+    return np.rint(127 + 100 * np.sin(waves)).astype(np.uint8), z.astype(np.float32)
+
+
+def poses(times_s: np.ndarray) -> np.ndarray:
+    return se3.exp(times_s[:, None] * TWIST)
+
+
+def rows(middle_s: float) -> np.ndarray:
+    return poses(middle_s + 1e-9 * row_times_ns(CAMERA.height, READOUT_S))
+
+
+def still(middle_s: float) -> tuple[np.ndarray, np.ndarray]:
+    return shot(np.repeat(poses(np.array([middle_s])), CAMERA.height, axis=0))
+
+
+def differences(
+    color: np.ndarray, depth: np.ndarray, usable: np.ndarray, middle_s: float
+) -> tuple[float, float]:
+    """90th percentiles, gray values and meters."""
+    true_color, true_depth = still(middle_s)
+    off = np.abs(color.astype(float) - true_color)[usable]
+    both = usable & (depth > 0)
+    return float(np.percentile(off, 90)), float(np.percentile(np.abs(depth - true_depth)[both], 90))
+
+
+def test_an_image_is_as_a_still_camera_takes_it() -> None:
+    color, depth = shot(rows(0.0))
+    unrolling = Unrolling(CAMERA, rows(0.0), depth)
+    assert unrolling.is_needed
+    usable = unrolling.usable(None)
+    assert 0.9 < usable.mean() < 1
+    before = differences(color, depth, usable, 0.0)
+    after = differences(unrolling.color(color), unrolling.depth(DepthImage(depth)).depth_m, usable, 0.0)
+    assert before[0] > 12
+    assert before[1] > 0.006
+    assert after[0] < 4
+    assert after[1] < 0.004
+
+
+def test_what_may_not_be_used_moves_along() -> None:
+    _, depth = shot(rows(0.0))
+    unrolling = Unrolling(CAMERA, rows(0.0), depth)
+    mask = np.ones(depth.shape, dtype=bool)
+    mask[:, :40] = False
+    found = unrolling.usable(mask)
+    assert not np.array_equal(found, mask & unrolling.usable(None))
+    sigma = np.full(depth.shape, 0.01, np.float32)
+    moved = unrolling.depth(DepthImage(np.where(mask, depth, np.float32(0)), sigma))
+    assert moved.sigma_m is not None
+    assert np.array_equal(moved.sigma_m > 0, moved.depth_m > 0)
+    assert not moved.depth_m[found ^ unrolling.usable(None)][:100].all()
+
+
+def test_a_camera_that_stands_changes_nothing() -> None:
+    depth = np.full((120, 160), 2.0, np.float32)
+    assert not Unrolling(CAMERA, np.tile(np.eye(4), (120, 1, 1)), depth).is_needed
+
+
+@pytest.mark.parametrize("text", ["-0.01", "30", "fast", "nan"])
+def test_a_readout_that_no_camera_has_is_refused(text: str) -> None:
+    with pytest.raises(DuagError, match="rolling_shutter_s"):
+        Readout.stated({"rolling_shutter_s": text}, "a.mcap")
+
+
+def test_depth_is_read_as_color_if_it_states_nothing() -> None:
+    assert Readout.stated({"rolling_shutter_s": "0.02"}, "") == Readout(0.02, 0.02)
+    assert Readout.stated({"rolling_shutter_s": "0.02", "depth_rolling_shutter_s": "0.03"}, "") == Readout(
+        0.02, 0.03
+    )
+    assert not Readout.stated({}, "").rolls
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_frames_of_a_log_are_still_once_its_motion_is_known(tmp_path: Path, stated: bool) -> None:
+    times = np.arange(5) / 30
+    sensors = {"rolling_shutter_s": str(READOUT_S)} if stated else {}
+    with (
+        RecordingWriter(tmp_path / "rec") as recording,
+        recording.robot("alpha", CAMERA, SCALE_M, sensors, find_regions=False) as robot,
+    ):
+        for t in times:
+            color, depth = shot(rows(t))
+            units = np.rint(depth / SCALE_M).astype(np.uint16)
+            png = cv2.imencode(".png", color[:, :, ::-1])[1].tobytes()
+            robot.add_frame(round(1e9 * t), png, "png", units)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        read = log.frame(2)
+        assert log.needs_motion == stated
+        log.move_depth(Trajectory(np.rint(1e9 * times).astype(np.int64), poses(times)))
+        found = log.frame(2)
+    if not stated:
+        assert np.array_equal(found.color, read.color)
+        assert np.array_equal(found.depth, read.depth)
+        return
+    assert found.mask is not None
+    after = differences(found.color, found.depth, found.mask, times[2])
+    assert after[0] < 4
+    assert after[1] < 0.004
