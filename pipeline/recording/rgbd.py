@@ -282,6 +282,17 @@ class RgbdLog:
         found = Unrolling(self.camera, T_middle_row, depth.depth_m)
         return found if found.is_needed else None
 
+    def still_depth(self, stamp_ns: int, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth of the rows of a color image, as an exact one has it, moved as the color is.
+
+        Args:
+            stamp_ns: of the frame.
+            depth_m: [H, W], 0 = unknown.
+        """
+        depth = DepthImage(depth_m)
+        still = self._unrolling(stamp_ns, stamp_ns, self.readout.color_s, depth)
+        return depth_m if still is None else still.depth(depth).depth_m
+
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [H, W] with 0 where the camera never shows the scene."""
         return values if self.valid is None else np.where(self.valid, values, np.float32(0))

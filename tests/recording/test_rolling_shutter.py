@@ -118,11 +118,13 @@ def test_frames_of_a_log_are_still_once_its_motion_is_known(tmp_path: Path, stat
         assert log.needs_motion == stated
         log.move_depth(Trajectory(np.rint(1e9 * times).astype(np.int64), poses(times)))
         found = log.frame(2)
+        exact = log.still_depth(found.stamp_ns, shot(rows(times[2]))[1])
     if not stated:
         assert np.array_equal(found.color, read.color)
         assert np.array_equal(found.depth, read.depth)
         return
     assert found.mask is not None
+    assert differences(found.color, exact, found.mask, times[2])[1] < 0.004
     after = differences(found.color, found.depth, found.mask, times[2])
     assert after[0] < 4
     assert after[1] < 0.004
