@@ -17,12 +17,14 @@ from pydantic import Field
 from duagc.converters.layouts import image_folder, tum_layout
 from duagc.converters.layouts.image_files import image_size, options_of
 from duagc.converters.layouts.image_folder import Clip
+from duagc.converters.layouts.kinect import kinect_readout
 from duagc.converters.robot_writer import check_camera
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 1 / 5000
+KINECT = "Kinect v1"
 CAMERAS = {  # intrinsics and (k1, k2, p1, p2, k3), as the dataset's page gives them
     "freiburg1": (
         PinholeCamera(640, 480, 517.306408, 516.469215, 318.643040, 255.313989),
@@ -49,6 +51,8 @@ class Options(tum_layout.AssociationOptions):
     undistort: bool = True
     """Take the lens distortion out of color and depth together; without, images stay as they are and a pinhole camera
     does not describe them."""
+    rolling_shutter: Literal["auto", "none"] = "auto"
+    """Readout of the images that the log states: auto is that of a first Kinect where the camera is one."""
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
@@ -60,13 +64,15 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     settings = options_of(Options, options, "tum")
     frames, _, warnings = tum_layout.frames_of(src, settings)
     camera, distortion, sensor = _camera(src, settings, frames[0].color)
+    stated = settings.rolling_shutter == "auto" and sensor == KINECT
+    readout = kinect_readout() if stated else {}
     clip = Clip(
         "",
         frames,
         camera,
         settings.depth_scale,
         distortion=distortion if settings.undistort else (),
-        sensors={"depth": f"{sensor}, registered to color by the dataset"},
+        sensors={"depth": f"{sensor}, registered to color by the dataset"} | readout,
     )
     image_folder.write_parts(
         out, "tum", src, clip, robots=robots, options=settings, warnings=warnings, force=force
@@ -80,9 +86,9 @@ def _camera(src: Path, settings: Options, image: Path) -> tuple[PinholeCamera, t
     if settings.intrinsics:
         return *_stated(settings.intrinsics, "intrinsics", image), "depth camera"
     if settings.camera != "auto":
-        return *CAMERAS[settings.camera], "Kinect v1"
+        return *CAMERAS[settings.camera], KINECT
     if match:
-        return *CAMERAS[f"freiburg{match[0][-1]}"], "Kinect v1"
+        return *CAMERAS[f"freiburg{match[0][-1]}"], KINECT
     if stated.is_file():
         return *_stated(read_text(stated, "fx fy cx cy"), str(stated), image), "depth camera"
     raise DuagError(

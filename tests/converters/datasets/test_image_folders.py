@@ -20,6 +20,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd, read_log
+from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.schemas import topics
 from tests.fixtures.box_room import path, render, save
 from tests.fixtures.image_folders import CASES, FRAMES, smooth, traj_line, tum_line
@@ -142,12 +143,13 @@ def test_poses_are_interpolated_and_never_extrapolated() -> None:
 def test_distortion_matters(made: dict[str, tuple[Path, Path]], tmp_path: Path) -> None:
     """Left in, it shows in the depth along a wall."""
     src, recording = made["tum"]
-    registry.convert("tum", src, tmp_path / "raw", options=["undistort=false"])
+    registry.convert("tum", src, tmp_path / "raw", options=["undistort=false", "rolling_shutter=none"])
     errors = []
     for folder in (recording, tmp_path / "raw"):
         with open_rgbd(folder / "alpha.mcap") as log:
             frame = log.frame(0)
             _, z = render(log.camera, smooth(0.05))
+            assert log.readout.rolls == (folder == recording)
         seen = frame.depth > 0
         errors.append(np.percentile(np.abs(frame.depth - z)[seen], 90))
     assert errors[0] < 0.01
@@ -266,6 +268,7 @@ def test_other_cameras_in_the_layout_of_tum(made: dict[str, tuple[Path, Path]], 
         open_rgbd(tmp_path / "filed" / "alpha.mcap") as filed,
     ):
         assert stated.camera == log.camera
+        assert (log.readout, stated.readout) == (Readout(0.026, 0.0305), Readout())  # of a first Kinect alone
         np.testing.assert_array_equal(stated.frame(1).depth, log.frame(1).depth)
         np.testing.assert_array_equal(stated.frame(1).color, log.frame(1).color)
         assert filed.camera == PinholeCamera(640, 480, 530.0, 531.0, 320.5, 239.5)
