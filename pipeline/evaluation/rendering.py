@@ -279,8 +279,6 @@ def _views(
             depth_m = frame.depth
         elif not isinstance(exact, Absent):
             depth_m = exact.get(frame.stamp_ns, Absent("the frame has no exact depth"))
-            if not isinstance(depth_m, Absent):
-                depth_m = log.still_depth(frame.stamp_ns, depth_m)
         yield views.ScoredFrame(frame, depth_m, exposures.at(index))
 
 

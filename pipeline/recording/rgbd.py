@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -101,9 +101,7 @@ class RgbdLog:
         self._depth_at = self._log.entries_by_time(self._source.topic)
         self.pairing = pair(self._color_at, self._depth_at)
         self.depth_delay_ns = 0
-        stated = Readout.stated(dict(self._log.metadata()).get(LOG_RECORD, {}), str(self.path))
-        registered = self._source.topic == topic_table.DEPTH.of(self.robot)
-        self.readout = stated if registered else replace(stated, depth_s=0.0)
+        self.readout = Readout.stated(dict(self._log.metadata()).get(LOG_RECORD, {}), str(self.path))
         self._motion: DepthMotion | None = None
         if not len(self.pairing.offsets_ns):
             raise DuagError(
@@ -281,17 +279,6 @@ class RgbdLog:
         T_middle_row = se3.inverse(T_color_then[-1]) @ T_color_then[:-1]
         found = Unrolling(self.camera, T_middle_row, depth.depth_m)
         return found if found.is_needed else None
-
-    def still_depth(self, stamp_ns: int, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth of the rows of a color image, as an exact one has it, moved as the color is.
-
-        Args:
-            stamp_ns: of the frame.
-            depth_m: [H, W], 0 = unknown.
-        """
-        depth = DepthImage(depth_m)
-        still = self._unrolling(stamp_ns, stamp_ns, self.readout.color_s, depth)
-        return depth_m if still is None else still.depth(depth).depth_m
 
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [H, W] with 0 where the camera never shows the scene."""

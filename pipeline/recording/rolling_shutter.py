@@ -23,8 +23,7 @@ from duagc.pipeline.recording.depth_sources import DepthImage
 
 Image = NDArray[np.float32]
 COLOR_READOUT_KEY, DEPTH_READOUT_KEY = "rolling_shutter_s", "depth_rolling_shutter_s"
-"""In the metadata of a log: seconds from the first to the last row of an image, the stamp in the middle of them. Depth
-that is registered to color and states none is read as color is."""
+"""In the metadata of a log: seconds from the first to the last row of an image, the stamp in the middle of them."""
 LONGEST_S = 0.2
 LEAST_MOVE_PX = 0.25  # of a pixel between the middle row and its own: less is not worth to interpolate for
 STEP_PX = 16  # between the pixels whose motion is computed; that of the others is interpolated
@@ -58,7 +57,7 @@ class Readout:
         """
         found: list[float] = []
         for key in (COLOR_READOUT_KEY, DEPTH_READOUT_KEY):
-            text = metadata.get(key, repr(found[0]) if found else "0")
+            text = metadata.get(key, "0")
             try:
                 seconds = float(text)
             except ValueError:
