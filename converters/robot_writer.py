@@ -70,7 +70,8 @@ class RobotWriter:
             camera: of color and depth alike.
             depth_scale: meters per unit of the depth images.
             sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's
-                metadata.
+                metadata. `rolling_shutter_s` and `depth_rolling_shutter_s` say how long images are read
+                (`recording.rolling_shutter`).
             find_regions: leave out large regions at the border that do not show the scene: black in all images, as a
                 vignette is, or the robot itself.
         """

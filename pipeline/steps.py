@@ -71,7 +71,7 @@ def check_log(log: Path, robot: str) -> dict[str, int]:
         return {
             "frames": len(camera),
             "pixels": camera.camera.width * camera.camera.height,
-            "moved": int(camera.pairing.largest_offset_ns > 0),
+            "moved": int(camera.needs_motion),
         }
 
 

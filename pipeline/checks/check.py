@@ -114,7 +114,7 @@ def _check_robot(
     report.robots[robot] = {
         "frames": len(log),
         "pixels": log.camera.width * log.camera.height,
-        "moved": int(log.pairing.largest_offset_ns > 0),
+        "moved": int(log.needs_motion),
         "depth_m": [round(value, 4) for value in sight.depth_m] if sight.known else None,
         "with_depth": round(sight.known, 4),
         "registered_pairs": f"{sum(move.T_first_second is not None for move in moved)} of {len(moved)}",
