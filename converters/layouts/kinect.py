@@ -3,7 +3,8 @@
 from duagc.pipeline.recording.rolling_shutter import COLOR_READOUT_KEY, DEPTH_READOUT_KEY
 
 COLOR_READOUT_S, DEPTH_READOUT_S = 0.026, 0.0305
-"""From the first row of an image to the last (Ringaby and Forssén, ICCV 2011)."""
+"""From the first row of an image to the last: about what Ringaby and Forssén (ICCV 2011) measured, from memory. That
+rows of fr1_desk are taken so is in docs/lab/2026-11-22-rolling-shutter.md."""
 
 
 def kinect_readout() -> dict[str, str]:

@@ -27,9 +27,7 @@ COLOR_READOUT_KEY, DEPTH_READOUT_KEY = "rolling_shutter_s", "depth_rolling_shutt
 LONGEST_S = 0.2
 LEAST_MOVE_PX = 0.25  # of a pixel between the middle row and its own: less is not worth to interpolate for
 STEP_PX = 16  # between the pixels whose motion is computed; that of the others is interpolated
-ROUNDS = (
-    3  # of looking up the row of a pixel; each brings it nearer by the share that the motion changes by row
-)
+ROUNDS = 3  # of looking up the row of a pixel; each brings it nearer by as much as the motion changes by row
 
 
 @dataclass(frozen=True)
@@ -171,9 +169,8 @@ class Unrolling:
 
         x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)[None]
         y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)[:, None]
-        third = self._T_row_middle[:, 2].astype(np.float32)[
-            ..., None
-        ]  # z when the row was read, of a point now
+        # z when the row was read, of a point now
+        third = self._T_row_middle[:, 2].astype(np.float32)[..., None]
         read_m = nearest(depth.depth_m)
         z = (read_m - third[:, 3]) / (third[:, 0] * x + third[:, 1] * y + third[:, 2])
         found = np.where((read_m > 0) & (z > 0), z, np.float32(0)).astype(np.float32)
