@@ -219,12 +219,8 @@ class Rasterizer:
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         wanted = _NO_MASK if mask is None else checked_mask(mask, (height, width))
-        ray_plane = depth_kind == "ray_plane"
-        return (
-            height,
-            width,
-            (pose, intrinsics, behind, wanted, ray_plane, width, height, operator.index(self.threads)),
-        )
+        ray_plane, threads = depth_kind == "ray_plane", operator.index(self.threads)
+        return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, threads)
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
         """Remember what was drawn, or refuse what could not be."""
@@ -276,9 +272,8 @@ class Rasterizer:
         diagonal = zeros(n, FISHER_DIAGONAL_COLUMNS) if fisher else NOTHING
         status = self._raster.backward(*arrays_of(gaussians), *images, *out, diagonal, by_pose)
         refuse_bad_image(status, dict.fromkeys(("d_color", "d_depth", "d_alpha"), NOT_FINITE))
-        return gradients_of(
-            out if parameters else None, by_pose if pose else None, diagonal if fisher else None
-        )
+        shown = diagonal if fisher else None
+        return gradients_of(out if parameters else None, by_pose if pose else None, shown)
 
     def fisher(
         self, inv_var_color: Image, inv_var_depth: Image, sums: FisherSums, residual: Image | None = None
