@@ -1,10 +1,10 @@
 """Tracking by rendering, to compare with: the pose of a frame by gradient steps on a map of Gaussians.
 
-The idea of SplaTAM (Keetha et al. 2024) and MonoGS (Matsuki et al. 2024), from what their papers say: from the
+The idea of SplaTAM (Keetha et al. 2024) and MonoGS (Matsuki et al. 2024), as their papers are remembered: from the
 prediction by constant velocity, Adam moves pose and exposure against the color and depth loss of the rendered map,
 where that is opaque; the pose of the least loss counts. The map grows at keyframes, by the mapper of this project, and
-the poses of its keyframes stay. Step lengths and numbers of steps are those of the papers; there is neither an image
-pyramid nor a test of whether the pose can be true.
+the poses of its keyframes stay. Step lengths are those of MonoGS, from memory too; there is neither an image pyramid
+nor a test of whether the pose can be true.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from duagc.pipeline.frontend.other_tracker import OtherTracker, Placed, ReadFram
 from duagc.pipeline.geometry import masks, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
+from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
 from duagc.pipeline.kernels import LossWeights, Rasterizer
 from duagc.pipeline.registration.search import orthonormal
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -34,7 +35,6 @@ from duagc.pipeline.splat.losses import depth_certainty, halve
 
 FIRST_MOMENT, SECOND_MOMENT, EPSILON = 0.9, 0.999, 1e-12  # of Adam
 PARAMETERS = 8  # translation, rotation, log gain, offset
-SIGMA_OF_MEDIAN = 1.4826  # of absolute values of a normal distribution
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class PoseFit:
         of_depth = np.abs(drawn.depth[known] / drawn.alpha[known] - images.depth_m[known])
         shown = np.exp(fit.exposure[0]) * drawn.color[opaque] + fit.exposure[1]
         of_gray = np.abs((shown - images.color[opaque] * np.float32(1 / 255)).mean(axis=-1))
-        sigmas = [SIGMA_OF_MEDIAN * float(np.median(r)) if r.size else 0.0 for r in (of_depth, of_gray)]
+        sigmas = [MAD_TO_SIGMA * float(np.median(r)) if r.size else 0.0 for r in (of_depth, of_gray)]
         return sigmas[0], sigmas[1]
 
 

@@ -56,13 +56,25 @@ def write_logs(
     return gaussians
 
 
+def informed(
+    folder: Path, frontend: str = "frontend.mcap", out: str = "information.mcap", **settings: int
+) -> messages.GaussianInformation:
+    """The information of the logs of a folder."""
+    paths = [folder / file for file in ("alpha.mcap", frontend, out)]
+    threads = settings.pop("threads", 1)
+    return run_information(
+        *paths,
+        config=InformationConfig(**settings),
+        moving=MovingConfig(),
+        thickness_floor_m=THICKNESS_FLOOR_M,
+        threads=threads,
+    )
+
+
 def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: Path) -> None:
     gaussians = write_logs(tmp_path)
-    paths = [tmp_path / name for name in ("alpha.mcap", "frontend.mcap", "information.mcap")]
-    result = run_information(
-        *paths, config=InformationConfig(), moving=MovingConfig(), thickness_floor_m=THICKNESS_FLOOR_M
-    )
-    (record,) = read_log(paths[2])
+    result = informed(tmp_path)
+    (record,) = read_log(tmp_path / "information.mcap")
     assert record.topic == "/alpha/information"
     back = record.message()
     np.testing.assert_array_equal(back.ids, gaussians.ids)
@@ -71,9 +83,7 @@ def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: 
     assert back.window == "all"
     assert back.observations.max() == 3
     assert back.color_sigma == pytest.approx(0.05, rel=0.15)
-    settings = {"config": InformationConfig(), "moving": MovingConfig()}
-    settings["thickness_floor_m"] = THICKNESS_FLOOR_M
-    run_information(*paths[:2], tmp_path / "again.mcap", **settings, threads=3)
+    informed(tmp_path, out="again.mcap", threads=3)
     (again,) = read_log(tmp_path / "again.mcap")
     assert again.data == record.data
 
@@ -81,15 +91,8 @@ def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: 
 def test_held_out_frames_never_enter(tmp_path: Path) -> None:
     write_logs(tmp_path, held_out=(1,))
     with pytest.raises(DuagError, match=r"has frame 1, expected no frame that is held out"):
-        run_information(
-            tmp_path / "alpha.mcap",
-            tmp_path / "frontend.mcap",
-            tmp_path / "out.mcap",
-            config=InformationConfig(),
-            moving=MovingConfig(),
-            thickness_floor_m=THICKNESS_FLOOR_M,
-        )
-    assert not (tmp_path / "out.mcap").exists()
+        informed(tmp_path)
+    assert not (tmp_path / "information.mcap").exists()
 
 
 @pytest.mark.parametrize(("frames", "held_out"), [(4, (1,)), (4, (1, 2)), (0, (1,))])
@@ -100,10 +103,7 @@ def test_other_frames_show_the_deviation_unless_they_are_held_out(
         folder = tmp_path / name
         folder.mkdir()
         write_logs(folder, held_out=held_out, keyframes=(0, 3))
-        config = InformationConfig(deviation_frames=frames)
-        paths = [folder / file for file in ("alpha.mcap", "frontend.mcap", "information.mcap")]
-        settings = {"moving": MovingConfig(), "thickness_floor_m": THICKNESS_FLOOR_M}
-        return run_information(*paths, config=config, **settings).deviation_m
+        return informed(folder, deviation_frames=frames).deviation_m
 
     keyframes_alone = deviation_m("alone", (1, 2), 0)
     takes_part = frames > 0 and 2 not in held_out
@@ -115,11 +115,4 @@ def test_a_front_end_without_a_map_is_one_line(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "unfinished.mcap", "alpha"):
         pass
     with pytest.raises(DuagError, match="has no message, expected the map"):
-        run_information(
-            tmp_path / "alpha.mcap",
-            tmp_path / "unfinished.mcap",
-            tmp_path / "out.mcap",
-            config=InformationConfig(),
-            moving=MovingConfig(),
-            thickness_floor_m=THICKNESS_FLOOR_M,
-        )
+        informed(tmp_path, "unfinished.mcap")
