@@ -11,6 +11,7 @@ from duagc.pipeline.checks.confidence import above
 from duagc.pipeline.checks.findings import Finding, Severity
 from duagc.pipeline.checks.geometry import Move
 from duagc.pipeline.config.checks import MotionChecks
+from duagc.pipeline.geometry.statistics import mad_sigma
 
 FEWEST = 2  # pairs
 
@@ -96,7 +97,7 @@ def _length(move: Move, lengths: Callable[[int, int], float | None], config: Mot
 def _sigma_of_log(observable: Sequence[_Length], logs: np.ndarray) -> float:
     """Standard deviation of the logarithm of the median ratio: what differs between pairs, and what they share."""
     longer = np.array([length.longer_m for length in observable])
-    spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
+    spread = mad_sigma(logs - np.median(logs))
     random = np.array([length.random_m for length in observable]) / longer
     shared = float(np.median(np.array([length.mistaken_m for length in observable]) / longer))
     of_median = 1.2533 * max(spread, float(np.median(random))) / np.sqrt(len(observable))

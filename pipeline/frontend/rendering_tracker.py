@@ -27,7 +27,7 @@ from duagc.pipeline.frontend.other_tracker import OtherTracker, Placed, ReadFram
 from duagc.pipeline.geometry import masks, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
-from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
+from duagc.pipeline.geometry.statistics import mad_sigma
 from duagc.pipeline.kernels import LossWeights, Rasterizer
 from duagc.pipeline.registration.search import orthonormal
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -184,10 +184,10 @@ class PoseFit:
         )
         opaque = drawn.alpha >= self.config.min_alpha
         known = opaque & (images.depth_m > 0)
-        of_depth = np.abs(drawn.depth[known] / drawn.alpha[known] - images.depth_m[known])
+        of_depth = drawn.depth[known] / drawn.alpha[known] - images.depth_m[known]
         shown = np.exp(fit.exposure[0]) * drawn.color[opaque] + fit.exposure[1]
-        of_gray = np.abs((shown - images.color[opaque] * np.float32(1 / 255)).mean(axis=-1))
-        sigmas = [MAD_TO_SIGMA * float(np.median(r)) if r.size else 0.0 for r in (of_depth, of_gray)]
+        of_gray = (shown - images.color[opaque] * np.float32(1 / 255)).mean(axis=-1)
+        sigmas = [mad_sigma(r) if r.size else 0.0 for r in (of_depth, of_gray)]
         return sigmas[0], sigmas[1]
 
 
