@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -176,17 +176,29 @@ class Job:
         if plan.has(stages.EVALUATION):
             done.append(self._noted(chain.reader, stages.EVALUATION, done, notes, workers))
             self._write(done)
-        readers = []
-        if plan.has(stages.REPORT):
-            shown = {
-                "config.toml": _digest_of(dump_config(self.config)),
-                "times": _digest_of(self._times(done)),
-            }
-            readers.append(self._noted(chain.reader, stages.REPORT, done, notes | shown, workers))
-        if plan.has(stages.VIEW):
-            readers.append(self._noted(chain.reader, stages.VIEW, done, notes, workers))
+        readers = self._shown(chain, done, notes, workers)
         self._write([*done, *readers])
         return [*self._before, *done, *readers]
+
+    def _shown(
+        self, chain: Chain, done: list[Carried], notes: dict[str, str], workers: Callable[[], int]
+    ) -> list[Carried]:
+        """Report and view; next to each other if there are several workers."""
+        config = _digest_of(dump_config(self.config))
+        of_report = notes | {"config.toml": config, "times": _digest_of(self._times(done))}
+        wanted = {stages.REPORT: of_report, stages.VIEW: notes}
+        wanted = {stage: more for stage, more in wanted.items() if self.plan.has(stage)}
+        if len(wanted) > 1 and not self.carrier.looking:
+            looking = Chain(self.recording, self._looking_carrier(), self.digests)
+            view = {stages.VIEW.name: partial(looking.reader, stages.VIEW, done, notes, workers)}
+            _, absent = self._looked_up(view, lambda name: view[name]())
+            if absent and workers() > 1:
+                with self._processes().viewing(done, notes) as drawn:
+                    report = self._noted(
+                        chain.reader, stages.REPORT, done, of_report, lambda: workers() - 1
+                    )
+                    return [report, drawn.result()]
+        return [self._noted(chain.reader, stage, done, more, workers) for stage, more in wanted.items()]
 
     def look(self) -> tuple[list[Carried], list[StageKey]]:
         """What is there, and what would have to be computed as far as that is known."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -194,6 +196,26 @@ class RobotProcesses:
             exchange: of the team.
         """
         return self._chain(watch.UNWATCHED).fusion(name, robot, exchange, threads=SharedThreads())
+
+    @contextmanager
+    def viewing(self, done: Sequence[Carried], more: Mapping[str, str]) -> Iterator[Future[Carried]]:
+        """While the run is written as Rerun shows it, in a process of its own.
+
+        Args:
+            done: as of `Chain.reader`.
+            more: as of `Chain.reader`.
+        """
+        with worker_pool(1) as pool:
+            yield pool.submit(self.view, done, more)
+
+    def view(self, done: Sequence[Carried], more: Mapping[str, str]) -> Carried:
+        """The run as Rerun shows it.
+
+        Args:
+            done: as of `Chain.reader`.
+            more: as of `Chain.reader`.
+        """
+        return self._chain(watch.UNWATCHED).reader(stages.VIEW, done, more, lambda: 1)
 
     def _chain(self, heard: watch.Watch) -> Chain:
         """The stages, in a process that knows nothing of the run yet."""

@@ -95,7 +95,8 @@ class TimeLeft:
             *((stages.FUSION, seconds) for seconds in fused_s),
             (stages.EVALUATION, self._evaluation.predicted_s()),
             (stages.REPORT, durations.REPORT_S),
-            (stages.VIEW, durations.VIEW_S),
+            # next to the report if there are several workers
+            (stages.VIEW, durations.VIEW_S if reading == 1 or stages.REPORT not in self._wanted else 0.0),
         ]
         self._later = [(stage.name, seconds) for stage, seconds in expected if stage in self._wanted]
         if stages.EVALUATION in self._wanted:
