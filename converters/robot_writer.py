@@ -143,6 +143,7 @@ class RobotWriter:
         T_world_camera: NDArray[np.float64] | None = None,
         exact_depth: NDArray[np.uint16] | None = None,
         mask: NDArray[np.bool_] | None = None,
+        true_mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: NDArray[np.floating] | None = None,
         depth_stamp_ns: int | None = None,
     ) -> None:
@@ -158,6 +159,7 @@ class RobotWriter:
                 known.
             exact_depth: like depth, without noise, where that differs and is known.
             mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
+            true_mask: the same for the ground truth, where the log is not to have it.
             depth_sigma_m: [H, W], standard deviation of the depth in meters, where it is known pixel by
                 pixel: then with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
             depth_stamp_ns: time of the depth, one that no other depth has; None: that of the color.
@@ -165,7 +167,7 @@ class RobotWriter:
             ValueError: an image has another size than the camera, or the time does not increase.
             DuagError: the true pose is beyond FAR_M.
         """
-        self._check_frame(stamp_ns, color_format, (depth, mask, depth_sigma_m))
+        self._check_frame(stamp_ns, color_format, (depth, mask, true_mask, depth_sigma_m))
         name = self.name
         if not self._stamps:
             calibration = messages.pack_calibration(stamp_ns, name, self.camera)
@@ -175,14 +177,16 @@ class RobotWriter:
         if self._regions is not None:
             self._regions.add(index, stamp_ns, color, depth)
         self._stamps.append(int(stamp_ns))
-        self._log.write(
-            topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
-        )
+        image = messages.pack_color(stamp_ns, name, color, color_format)
+        self._log.write(topics.COLOR.of(name), image, stamp_ns)
         if depth is not None:
             taken_ns = stamp_ns if depth_stamp_ns is None else max(int(depth_stamp_ns), 0)
             self._add_registered_depth(stamp_ns, taken_ns, depth, depth_sigma_m)
         if mask is not None:
             self._log.write(topics.MASK.of(name), messages.pack_mask(stamp_ns, name, mask), stamp_ns)
+        if true_mask is not None:
+            truth_topic = topics.GROUNDTRUTH_MASK.of(name)
+            self._truth_log().write(truth_topic, messages.pack_mask(stamp_ns, name, true_mask), stamp_ns)
         if T_world_camera is not None:
             self._add_true_pose(stamp_ns, np.asarray(T_world_camera))
         if exact_depth is not None:
@@ -274,9 +278,8 @@ class RobotWriter:
         if self._announce(topics.RAW_DEPTH_TRANSFORM, stamp_ns, "depth_camera"):
             calibration = messages.pack_calibration(stamp_ns, self.name, self._depth_camera)
             self._log.write(topics.RAW_DEPTH_CALIBRATION.of(self.name), calibration, stamp_ns)
-        self._log.write(
-            topics.RAW_DEPTH.of(self.name), messages.pack_depth(stamp_ns, self.name, depth), stamp_ns
-        )
+        message = messages.pack_depth(stamp_ns, self.name, depth)
+        self._log.write(topics.RAW_DEPTH.of(self.name), message, stamp_ns)
 
     def set_lidar(self, T_camera_lidar: NDArray[np.float64], range_sigma_m: float | None) -> None:
         """Announce a LiDAR.

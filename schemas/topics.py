@@ -143,6 +143,13 @@ GROUNDTRUTH_DEPTH = Topic(
     Scope.TRUTH,
     "exact depth, 16UC1 with depth_scale, where the log's depth is noisy",
 )
+GROUNDTRUTH_MASK = Topic(
+    "/<robot>/groundtruth/mask",
+    "foxglove.RawImage",
+    "converters",
+    Scope.TRUTH,
+    "8UC1, 255 where nothing moves, 0 elsewhere, where the log has no mask",
+)
 ODOMETRY = Topic("/<robot>/odometry", "duagc.v1.Odometry", "frontend", Scope.ROBOT, "pose of every frame")
 KEYFRAME = Topic("/<robot>/keyframe", "duagc.v1.Keyframe", "frontend", Scope.ROBOT, "pose of every keyframe")
 KEYFRAME_FACTOR = Topic(
@@ -276,6 +283,7 @@ TOPICS: tuple[Topic, ...] = (
     IMU_TRANSFORM,
     GROUNDTRUTH_POSE,
     GROUNDTRUTH_DEPTH,
+    GROUNDTRUTH_MASK,
     ODOMETRY,
     KEYFRAME,
     KEYFRAME_FACTOR,

@@ -72,7 +72,8 @@ class SimulationSettings:
         up: of meshes, the axis that is up in the files: "y", "z", or "auto", as is custom for their format.
         paradigm: the figure that the paths draw together, one of `PARADIGMS`; "wander" is none.
         rig: the sensors.
-        movers: figures that walk through the scene; a mask says where they are.
+        movers: figures that walk through the scene.
+        masks: whether the log has masks that say where these are; else only the ground truth has.
         covers: when a lens is covered.
         degradations: what makes the camera worse than an ideal one.
         triangles: make triangles of the room even if nothing needs them.
@@ -89,6 +90,7 @@ class SimulationSettings:
     paradigm: str = "wander"
     rig: Rig = field(default_factory=Rig)
     movers: int = 0
+    masks: bool = True
     covers: tuple[Cover, ...] = ()
     degradations: Degradations = field(default_factory=Degradations)
     triangles: bool = False
@@ -166,6 +168,8 @@ class SimulationSettings:
                 f"simulate: motion blur is given as {d.blur_px:g} px and as {self.rig.exposure_s:g} s of exposure, "
                 "expected one of them"
             )
+        if not self.masks and not self.movers:
+            raise DuagError("simulate: masks are withheld without movers, expected movers")
         if d.lens_k1 != 0 and self.movers:
             raise DuagError("simulate: movers are seen through a lens, expected a camera without one")
 
@@ -177,6 +181,8 @@ class SimulationSettings:
             kept["paradigm"] = self.paradigm
         if self.rig != Rig() or self.movers:
             kept |= asdict(self.rig) | {"movers": self.movers}
+        if not self.masks:
+            kept["masks"] = False
         if self.covers:
             kept["covers"] = [asdict(cover) for cover in self.covers]
         if self.degradations != Degradations():

@@ -50,6 +50,7 @@ def simulate(
     preview: Path | None = None,
     rig: Rig | None = None,
     movers: int = 0,
+    masks: bool = True,
     covers: Sequence[Cover] = (),
     degradations: Degradations | None = None,
     triangles: bool = False,
@@ -74,7 +75,8 @@ def simulate(
         paradigm: the figure that the paths draw together, one of `PARADIGMS`; "wander" is none.
         preview: a PNG file to write, with what the robots saw and their paths from above.
         rig: the sensors, if other than an RGB-D camera that does not move during a frame.
-        movers: figures that walk through the scene; a mask says where they are.
+        movers: figures that walk through the scene.
+        masks: whether the log has masks that say where these are; else only the ground truth has.
         covers: when a lens is covered: the robot moves on and sees nothing.
         degradations: what makes the camera worse than an ideal one; None: nothing.
         triangles: make triangles of the room even if nothing needs them: its paths are then those of recordings
@@ -94,6 +96,7 @@ def simulate(
         paradigm=paradigm,
         rig=rig or Rig(),
         movers=movers,
+        masks=masks,
         covers=tuple(covers),
         degradations=degradations or Degradations(),
         triangles=triangles,
@@ -302,7 +305,8 @@ class _Team:
                         image.depth,
                         T_world_camera=path[i],
                         exact_depth=image.exact_depth,
-                        mask=image.mask,
+                        mask=image.mask if self.settings.masks else None,
+                        true_mask=None if self.settings.masks else image.mask,
                         depth_sigma_m=image.sigma_m,
                     )
                     if image.points is not None:

@@ -66,7 +66,10 @@ def simulate(
     depth_delay_ms: Annotated[float, typer.Option(help="How much older depth is than its time says.")] = 0,
     missing: Annotated[float, typer.Option(help="Share of the frames that are missing: 0.2.")] = 0,
     rate_hz: Annotated[float, typer.Option(help="Frames a second, of a path with 30.")] = 30,
-    movers: Annotated[int, typer.Option(min=0, max=8, help="Figures that walk about, with masks.")] = 0,
+    movers: Annotated[int, typer.Option(min=0, max=8, help="Figures that walk about.")] = 0,
+    masks: Annotated[
+        bool, typer.Option(help="Say where they are; if not, only the ground truth has it.")
+    ] = True,
     cover: Annotated[
         list[str] | None,
         typer.Option(
@@ -111,6 +114,7 @@ def simulate(
         preview=preview,
         rig=Rig(sensor, readout_ms / 1000, exposure_ms / 1000, gain_stops, clock_ms / 1000, camera_stops),
         movers=movers,
+        masks=masks,
         covers=[Cover.parse(text) for text in cover or ()],
         degradations=Degradations(
             auto_exposure=auto_exposure,

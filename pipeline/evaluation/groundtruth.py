@@ -18,7 +18,7 @@ from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry.trajectory import Trajectory
-from duagc.pipeline.messages import unpack_depth, unpack_pose_in_frame
+from duagc.pipeline.messages import unpack_depth, unpack_mask, unpack_pose_in_frame
 from duagc.pipeline.recording import DEPTH_SCALE_KEY, Recording, read_log, verify
 from duagc.schemas import topics
 
@@ -50,6 +50,20 @@ def exact_depths(
             raw = unpack_depth(record.message(), f"{path}: {topic} at {record.publish_time_ns} ns")
             found[record.publish_time_ns] = raw.astype(np.float32) * np.float32(scale)
     return found or Absent("the recording has no exact depth")
+
+
+def static_masks(
+    recording: Recording, robot: str, stamps_ns: Collection[int]
+) -> dict[int, NDArray[np.bool_]]:
+    """Where nothing moves [h, w], by time stamp, of the wanted stamps; none where the log has the masks itself."""
+    path, topic = recording.groundtruth(robot), topics.GROUNDTRUTH_MASK.of(robot_of(robot))
+    if path is None:
+        return {}
+    return {
+        record.publish_time_ns: unpack_mask(record.proto(), f"{path}: {topic} at {record.publish_time_ns} ns")
+        for record in read_log(path, topics=[topic])
+        if record.publish_time_ns in stamps_ns
+    }
 
 
 def recorded_depth_is_exact(recording: Recording, robot: str) -> bool:

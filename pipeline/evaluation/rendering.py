@@ -8,7 +8,7 @@ drawn in the colors of the camera that took the view.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -250,10 +250,12 @@ class RenderTask:
             log.move_depth_by(robot.folder / "frontend.mcap")
             stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}
             exact = groundtruth.exact_depths(source, name, stamps)
+            still = groundtruth.static_masks(source, name, stamps)
             frames = _views(
                 log,
                 chosen,
                 exact,
+                still=still,
                 recorded_is_exact=groundtruth.recorded_depth_is_exact(source, name),
                 exposures=robot.exposures,
             )
@@ -269,11 +271,14 @@ def _views(
     indices: list[int],
     exact: Mapping[int, Any] | Absent,
     *,
+    still: Mapping[int, NDArray[np.bool_]],
     recorded_is_exact: bool,
     exposures: ExposureTrack,
 ) -> Iterator[views.ScoredFrame]:
     for index in indices:
         frame = log.frame(index)
+        if (static := still.get(frame.stamp_ns)) is not None:
+            frame = replace(frame, mask=static if frame.mask is None else static & frame.mask)
         depth_m: Any = exact
         if recorded_is_exact:
             depth_m = frame.depth

@@ -181,8 +181,7 @@ def prepare(
             if not folder.exists():
                 log(f"simulate: {data.robots} robots, {data.frames} frames each, seed {seed}")
                 folder.parent.mkdir(parents=True, exist_ok=True)
-                settings = {k: v for k, v in data.model_dump().items() if k not in ("width", "height")}
-                simulate(folder, size=(data.width, data.height), seed=seed, **settings)
+                simulate(folder, **vars(data.settings(seed)))
     for name, folder in recordings.items():
         folders[name] = folder.resolve()
     path = out / experiment.name / SUITE

@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
+from duagc.converters.simulate.sensors.rig import Rig
 from duagc.converters.simulate.settings import SimulationSettings
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_bytes
@@ -39,6 +40,10 @@ class SimulatedData(Config):
     paradigm: str = "wander"
     overlap: float = 0.6
     noise: str = "none"
+    sensor: str = "rgbd"
+    movers: int = 0
+    masks: bool = True
+    triangles: bool = False
 
     def settings(self, seed: int) -> SimulationSettings:
         """The same as the simulator has it.
@@ -55,6 +60,10 @@ class SimulatedData(Config):
             seed=seed,
             overlap=self.overlap,
             paradigm=self.paradigm,
+            rig=Rig(self.sensor),
+            movers=self.movers,
+            masks=self.masks,
+            triangles=self.triangles,
         )
 
 
@@ -73,7 +82,7 @@ class RuleConfiguration(Config):
 
     set: tuple[str, ...] = ()
     """`a.b=value`."""
-    data: dict[str, int | float | str] = Field(default_factory=dict)
+    data: dict[str, bool | int | float | str] = Field(default_factory=dict)
     """Of the data of the profile, what these runs have different; they are run on no other recording."""
 
 
