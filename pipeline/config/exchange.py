@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig, WeightKind
@@ -75,6 +75,26 @@ class InjectionConfig(Config):
     """Share of the matched Gaussians of a pair of robots whose partners are exchanged."""
     pose_dropouts: float = Field(default=0.0, ge=0.0, lt=1.0)
     """Probability that a robot sends no poses to a neighbor in a round."""
+    liar: str = ""
+    """Name of the robot whose messages are wrong, as the next settings say; what it computes for itself is right."""
+    false_poses_m: float = Field(default=0.0, ge=0.0)
+    """How far off it sends every keyframe, in a direction that is drawn for each: with solver `admm`, and as final."""
+    false_gaussians: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of its Gaussians that it sends with a wrong mean and as too certain."""
+    false_gaussian_m: float = Field(default=0.3, gt=0.0)
+    """How far off these means are, in a direction that is drawn for each."""
+    false_certainty: float = Field(default=10.0, ge=1.0)
+    """What it divides the standard deviation of these means by."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "InjectionConfig":
+        lies = self.false_poses_m > 0 or self.false_gaussians > 0
+        if lies != bool(self.liar):
+            raise ValueError(
+                f"exchange.injection.liar is {self.liar!r} with false_poses_m {self.false_poses_m:g} and "
+                f"false_gaussians {self.false_gaussians:g}, expected a name with one of these, or none of all"
+            )
+        return self
 
 
 class ExchangeConfig(Config):

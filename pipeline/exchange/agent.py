@@ -106,7 +106,7 @@ class Agent:
             graph.robot, team, neighbors, config.transport, seed=seed, loop_closing=loop_closing
         )
         self.team, self.own, self.neighbors = self.radio.team, self.radio.own, self.radio.neighbors
-        self._make_solver = solver or solver_of(config, len(self.team))
+        self._make_solver = solver or solver_of(config, len(self.team), seed)
         self.round = -1
         self.refused: Counter[str] = Counter()
         margin = config.consensus.closures.margin if loop_closing.revokes else np.inf

@@ -11,6 +11,7 @@ from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.recall import Recall, Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.exchange.injection import check_liar
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder, RawAlternative
 from duagc.pipeline.exchange.rounds import run_rounds
@@ -140,6 +141,7 @@ def team_of(
     names = sorted(d.robot for d in data)
     if len(set(names)) != len(names) or len(names) > MAX_TEAM:
         raise DuagError(f"team of {len(names)}: expected different names and at most {MAX_TEAM} robots")
+    check_liar(config.injection, names)
     linked = link_model.neighbors(config.link, names)
     by_name = {d.robot: d for d in data}
     return {

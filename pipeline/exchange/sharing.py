@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -74,6 +75,7 @@ class Sharing:
         self.current = CurrentPoses(self.own, len(self.team))
         self._body: NDArray[Any] | None = None
         self._records: NDArray[Any] | None = None
+        self._lies: NDArray[Any] | None = None
 
     # --- own evidence
 
@@ -98,11 +100,28 @@ class Sharing:
         """Which of the own records others get."""
         return slice(math.ceil(self.config.evidence_share * len(self.own_body())))
 
+    def _sent_body(self) -> NDArray[Any]:
+        """Own evidence as others get it."""
+        if self._lies is None:
+            records = injection.sent_evidence(
+                self.own_records(), self.config.injection, seed=self.seed, robot=self.data.robot
+            )
+            self._lies = self.own_body() if records is None else evidence_wire.to_body(self.kind, records)
+        return self._lies[self._sent()]
+
+    def _as_sent(self, poses: Anchors) -> Anchors:
+        """Own poses as others get them."""
+        T = poses.T_common_keyframe.copy()
+        T[:, :3, 3] = injection.sent_positions(
+            T[:, :3, 3], np.arange(len(T)), self.config.injection, seed=self.seed, robot=self.data.robot
+        )
+        return replace(poses, T_common_keyframe=T)
+
     def _own_evidence(self) -> bytes:
         k = self.knowledge
         if self.own not in k.evidence_bytes:
             k.evidence_bytes[self.own] = evidence_wire.write_evidence(
-                self.kind, self.own, self.data.depth, self.own_body()[self._sent()]
+                self.kind, self.own, self.data.depth, self._sent_body()
             )
         return k.evidence_bytes[self.own]
 
@@ -149,7 +168,8 @@ class Sharing:
             revoked: links that do not count.
             round_index: the current round.
         """
-        self.current.offer(Anchors(self.own, T_common_keyframe, T_map_first), revoked, round_index)
+        poses = self._as_sent(Anchors(self.own, T_common_keyframe, T_map_first))
+        self.current.offer(poses, revoked, round_index)
 
     def add_poses(self, T_common_keyframe: Array, T_map_first: Array) -> None:
         """Own poses became final: they are flooded.
@@ -160,7 +180,7 @@ class Sharing:
         """
         anchors = Anchors(self.own, T_common_keyframe, T_map_first)
         self.knowledge.anchors[self.own] = anchors
-        self.knowledge.anchors_bytes[self.own] = state_wire.write_anchors(anchors)
+        self.knowledge.anchors_bytes[self.own] = state_wire.write_anchors(self._as_sent(anchors))
 
     def complete(self, members: Sequence[int]) -> bool:
         """Whether agreed poses, evidence and matches of all members are here."""
@@ -253,8 +273,7 @@ class Sharing:
         if n.voxels is None or T_world_map is None:
             return None
         if owner == self.own:
-            sent, depth = self._sent(), self.data.depth
-            records, body = self.own_records()[sent], self.own_body()[sent]
+            records, body, depth = self.own_records()[self._sent()], self._sent_body(), self.data.depth
             T_common = T_world_map @ self.data.T_map_keyframe
         elif owner in k.anchors and (kind := k.depth(owner)) is not None:
             records, body, depth = k.evidence[owner], k.bodies[owner], kind

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
-from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.config.exchange import ExchangeConfig, InjectionConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.consensus.elimination import Variable
 from duagc.pipeline.consensus.pose_admm import PoseAgent, with_floor
 from duagc.pipeline.consensus.tree import TreeGraph, TreeNode, TreePlace
+from duagc.pipeline.exchange.injection import sent_positions
 from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.wire import elimination_wire, poses_wire
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
@@ -23,6 +24,7 @@ from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, RobustWeights
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, closures_as_relative_poses
 
 ROUNDING_STEPS = 4.0
+NO_INJECTION = InjectionConfig()
 
 
 @dataclass(frozen=True)
@@ -141,14 +143,23 @@ class PoseSolver(Protocol):
 class AdmmSolver:
     """`PoseAgent` with its packets in the states of the rounds."""
 
-    def __init__(self, start: SolverStart, config: PoseConsensusConfig) -> None:
+    def __init__(
+        self,
+        start: SolverStart,
+        config: PoseConsensusConfig,
+        injection: InjectionConfig = NO_INJECTION,
+        *,
+        seed: int = 0,
+    ) -> None:
         """Lay out the graph.
 
         Args:
             start: what the robot knows.
             config: the same at all robots.
+            injection: faults made on purpose.
+            seed: of these.
         """
-        self.own, self.config = start.index, config
+        self.own, self.config, self.injection, self.seed = start.index, config, injection, seed
         self.refused: list[str] = []
         self._arrived: list[tuple[int, bytes]] = []
         self._names = {link.index: link.name for link in start.links}
@@ -181,6 +192,10 @@ class AdmmSolver:
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
         packet = self.agent.outgoing(neighbor.name)
+        sent = sent_positions(
+            packet.translations, packet.keyframes, self.injection, seed=self.seed, robot=self.agent.robot
+        )
+        packet = replace(packet, translations=sent)
         return write_poses_in_parts(packet, room_bytes, self.own < neighbor.index)
 
     def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
@@ -342,17 +357,18 @@ class EliminationSolver:
 SolverFactory = Callable[[SolverStart], PoseSolver]
 
 
-def solver_of(config: ExchangeConfig, team: int) -> SolverFactory:
+def solver_of(config: ExchangeConfig, team: int, seed: int = 0) -> SolverFactory:
     """How a solver is made by the settings.
 
     Args:
         config: the same at all robots.
         team: number of robots.
+        seed: of faults made on purpose.
     """
 
     def make(start: SolverStart) -> PoseSolver:
         if config.solver == "admm":
-            return AdmmSolver(start, config.consensus)
+            return AdmmSolver(start, config.consensus, config.injection, seed=seed)
         if config.solver == "elected":
             from duagc.pipeline.exchange.elected import ElectedSolver  # which needs this module
 

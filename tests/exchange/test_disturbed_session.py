@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.exchange import ExchangeConfig, InjectionConfig
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
 from duagc.pipeline.exchange.map_agent import MapAgent
@@ -19,6 +21,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import Kind, Packet, chunk_bytes, parse, serialize
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.runs.robot_data import SessionResult
+from duagc.pipeline.splat.information import MEAN
 from tests.exchange.meeting import NAMES, Team, error_m, meet
 from tests.fixtures.results import same
 from tests.fixtures.sampling import sampled
@@ -116,6 +119,38 @@ def test_missing_poses_cost_rounds_and_false_matches_are_as_many_as_asked_for(
     assert len(true) == len(mixed)
     assert 0.2 < np.mean(np.any(true != mixed, axis=1)) < 0.6
     assert np.array_equal(np.sort(true[:, 1]), np.sort(mixed[:, 1]))
+
+
+def test_a_liar_sends_what_is_wrong_and_computes_with_what_is_right(
+    team: Team, undisturbed: dict[str, SessionResult], tmp_path: Path
+) -> None:
+    faults = InjectionConfig(liar="bravo", false_poses_m=0.02, false_gaussians=0.4, false_certainty=5.0)
+    limits = {"injection": faults, "max_rounds": 100}  # poses that contradict each other never settle
+    results = meet(team, 2, tmp_path, **limits)
+    own, heard = results["bravo"].own_evidence, results["alpha"].evidence["bravo"]
+    assert same(own, undisturbed["bravo"].own_evidence)
+    order = np.argsort(heard.ids)
+    off_m = np.linalg.norm(heard.theta[order, MEAN] - own.theta[:, MEAN], axis=1)
+    wrong = off_m > 0.29
+    assert 0.3 < wrong.mean() < 0.5
+    assert off_m[~wrong].max() < 0.01
+    ratio = heard.information[order][wrong, :3].sum() / own.information[wrong, :3].sum()
+    assert ratio == pytest.approx(25.0, rel=0.02)
+    placed, true = (results[name].T_world_keyframe_of["bravo"][:, :3, 3] for name in ("alpha", "bravo"))
+    assert np.linalg.norm(placed - true, axis=1).min() > 0.01
+    again, sent = replay_agent_of(
+        team["bravo"][0], ExchangeConfig(**limits), seed=0, exchange_path=tmp_path / "exchange.mcap"
+    )
+    assert sent.equal
+    assert same(again, results["bravo"])
+
+
+def test_a_liar_that_is_not_there_or_tells_the_truth_is_refused(team: Team, tmp_path: Path) -> None:
+    with pytest.raises(DuagError, match="injection.liar: robot 'delta', expected one of alpha, bravo"):
+        meet(team, 2, tmp_path, injection=InjectionConfig(liar="delta", false_poses_m=0.1))
+    for lies in ({"liar": "bravo"}, {"false_gaussians": 0.5}):
+        with pytest.raises(ValidationError, match="expected a name with one of these"):
+            InjectionConfig(**lies)
 
 
 def test_a_link_that_dies_leaves_the_way_around(team: Team, tmp_path: Path) -> None:
