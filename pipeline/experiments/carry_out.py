@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from fnmatch import fnmatchcase
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from duagc.pipeline.config import packages
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation.results import reason_of
-from duagc.pipeline.experiments.metric_names import names_in, needs_truth
+from duagc.pipeline.experiments.metric_names import names_in, needs_surface, needs_truth
 from duagc.pipeline.experiments.rule import Experiment, Profile, SimulatedData, config_of, data_of
 from duagc.pipeline.experiments.statistics import mean
 from duagc.pipeline.experiments.verdicts import ResultRow
@@ -38,7 +39,7 @@ UNTIL = "evaluation"
 
 
 def check_recordings(experiments: Sequence[Experiment], recordings: Mapping[str, Path]) -> None:
-    """Refuse recordings with a name that is taken, that cannot be opened, or that lack ground truth that is needed.
+    """Refuse recordings with a name that is taken, that cannot be opened, or that lack truth that is needed.
 
     Args:
         experiments: that will be run.
@@ -52,12 +53,14 @@ def check_recordings(experiments: Sequence[Experiment], recordings: Mapping[str,
             raise DuagError(f"--recording {name}: expected letters, digits, _ and ., and no seed_ in front")
         recording = Recording(folder)
         without = [robot for robot in recording.robots if recording.groundtruth(robot) is None]
-        for experiment in experiments if without else ():
-            needed = next((name for name in experiment.file.metrics if needs_truth(name)), None)
+        lacks = [(f"ground truth of {robot}", needs_truth) for robot in without[:1]]
+        if recording.geometry() is None:
+            lacks.append(("true surface (groundtruth.ply)", needs_surface))
+        for experiment, (lack, needs) in product(experiments, lacks):
+            needed = next((name for name in experiment.file.metrics if needs(name)), None)
             if needed is not None:
                 raise DuagError(
-                    f"{folder}: has no ground truth of {without[0]}, "
-                    f"expected it for metric {needed} of {experiment.name}"
+                    f"{folder}: has no {lack}, expected it for metric {needed} of {experiment.name}"
                 )
 
 

@@ -57,6 +57,7 @@ def _known() -> Iterator[str]:
 KNOWN = tuple(_known())
 """Every name, as in `results.parquet`; `robots.*` is the mean over the robots."""
 
+_OF_SURFACE = ("calibration.*",)
 _OF_TRUTH = ("*.ate_*", "*.rpe_*", "*_of_truth", "*.frames_with_truth", "calibration.*", "*.depth_l1_exact_m")
 
 
@@ -81,6 +82,15 @@ def needs_truth(name: str) -> bool:
         name: of the metric.
     """
     return any(fnmatchcase(name, pattern) for pattern in _OF_TRUTH)
+
+
+def needs_surface(name: str) -> bool:
+    """Whether a metric is absent for recordings without the true surface of the scene.
+
+    Args:
+        name: of the metric.
+    """
+    return any(fnmatchcase(name, pattern) for pattern in _OF_SURFACE)
 
 
 def names_in(name: str, numbers: Mapping[str, object]) -> list[str]:

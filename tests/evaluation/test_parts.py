@@ -10,14 +10,15 @@ from duagc import schemas
 from duagc.converters.simulate.ply import write_points
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.evaluation import map_errors, views
+from duagc.pipeline.evaluation import map_errors, rendering, views
 from duagc.pipeline.evaluation.groundtruth import Surface, surface
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import top_view_axes
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.kernels import Render
-from duagc.pipeline.recording import LogWriter
+from duagc.pipeline.recording import LogWriter, Recording, open_rgbd
 from duagc.pipeline.runs.digest import digest_file
 from duagc.pipeline.runs.folder import RunFolder, position_information
 from duagc.schemas import topics
@@ -71,6 +72,25 @@ def test_the_depth_of_one_layer_is_a_figure_of_its_own():
     without = views.score_view(a_render(), color, recorded, Absent("none"), layer_m=np.zeros_like(layer))
     assert isinstance(without.depth_l1_layer_m, Absent)
     assert views.score_view(a_render(), color, recorded, Absent("none")).depth_l1_layer_m == views.NO_LAYER
+
+
+def test_what_moves_by_the_truth_counts_in_no_view(tmp_path):
+    recording = Recording(make(tmp_path).recording)
+    with open_rgbd(recording.log("alpha")) as log:
+        stamps, shape = [log.frame(k).stamp_ns for k in (0, 1)], log.frame(0).depth.shape
+        left = np.zeros(shape, bool)
+        left[:, : shape[1] // 2] = True
+        made = rendering._views(
+            log,
+            [0, 1],
+            Absent("none"),
+            still={stamps[1]: left},
+            recorded_is_exact=False,
+            exposures=ExposureTrack(),
+        )
+        seen = [view.frame.mask for view in made]
+    assert seen[0] is None
+    assert np.array_equal(seen[1], left)
 
 
 def test_a_summary_counts_views_without_pose_apart():

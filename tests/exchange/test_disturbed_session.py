@@ -146,7 +146,7 @@ def test_a_liar_sends_what_is_wrong_and_computes_with_what_is_right(
 
 
 def test_a_liar_that_is_not_there_or_tells_the_truth_is_refused(team: Team, tmp_path: Path) -> None:
-    with pytest.raises(DuagError, match="injection.liar: robot 'delta', expected one of alpha, bravo"):
+    with pytest.raises(DuagError, match=r"injection\.liar: robot 'delta', expected one of alpha, bravo"):
         meet(team, 2, tmp_path, injection=InjectionConfig(liar="delta", false_poses_m=0.1))
     for lies in ({"liar": "bravo"}, {"false_gaussians": 0.5}):
         with pytest.raises(ValidationError, match="expected a name with one of these"):

@@ -8,7 +8,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.batch.suite import SuiteFile
-from duagc.pipeline.experiments.carry_out import prepare
+from duagc.pipeline.experiments.carry_out import check_recordings, prepare
 from duagc.pipeline.experiments.metric_names import KNOWN, names_in, needs_truth
 from duagc.pipeline.experiments.predicted import predicted_time
 from duagc.pipeline.experiments.rule import RULES, data_of, experiment_names, read_experiment
@@ -200,6 +200,34 @@ def test_a_recording_without_truth_is_refused_before_anything_runs(tmp_path: Pat
     ):
         assert_one_line(duagc_here("experiment", "run", "h1_team", "--recording", text, "--out", out), said)
     assert not out.exists()
+
+
+def test_a_recording_without_the_true_surface_is_refused_for_h3(tmp_path: Path) -> None:
+    fake = fake_run.make(tmp_path / "fake")
+    described = json.loads((fake.recording / "recording.json").read_text())
+    described.pop("geometry", None)
+    (fake.recording / "recording.json").write_text(json.dumps(described))
+    given, out = {"wall": fake.recording}, tmp_path / "out"
+    check_recordings([read_experiment("h1_team")], given)
+    result = duagc_here(
+        "experiment", "run", "h3_stereo", "--recording", f"wall={fake.recording}", "--out", out
+    )
+    assert_one_line(result, "has no true surface", "expected it for metric calibration.ece_rank of h3_stereo")
+    assert not out.exists()
+
+
+def test_sensors_and_movers_are_data_of_an_experiment(folder: Path) -> None:
+    text = FILE.replace("height = 32 }", 'height = 32, sensor = "stereo", movers = 2, masks = false }')
+    (folder / "mine.toml").write_text(text)
+    settings = read_experiment("mine", folder).profile("small").data.settings(3)
+    assert (settings.rig.sensor, settings.movers, settings.masks, settings.seed) == ("stereo", 2, False, 3)
+    for wrong, said in (
+        ("masks = false, movers = 0", "masks are withheld without movers"),
+        ('sensor = "sonar"', "sensor is 'sonar'"),
+    ):
+        (folder / "mine.toml").write_text(FILE.replace("height = 32 }", f"height = 32, {wrong} }}"))
+        with pytest.raises(DuagError, match=said):
+            read_experiment("mine", folder)
 
 
 def test_a_configuration_may_have_data_of_its_own(folder: Path) -> None:

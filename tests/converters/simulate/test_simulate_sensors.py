@@ -19,6 +19,7 @@ from duagc.converters.simulate.simulated_scenes import SimulatedMeshes
 from duagc.converters.simulate.team import simulate, twists_of
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd
 from tests.fixtures.mesh_scenes import ROOM, some_poses
@@ -133,6 +134,26 @@ def test_cameras_differ_by_channel(folder, tmp_path):
                 assert np.array_equal(after.depth, before.depth)
 
 
+def test_withheld_masks_are_known_to_the_truth_alone(folder, tmp_path):
+    simulate(
+        tmp_path / "rec",
+        scene=str(folder),
+        robots=1,
+        frames=2,
+        size=(64, 48),
+        workers=1,
+        movers=2,
+        masks=False,
+    )
+    recording = Recording(tmp_path / "rec")
+    with open_rgbd(recording.log("alpha")) as log:
+        frames = list(log.frames())
+    assert all(frame.mask is None for frame in frames)
+    true = groundtruth.static_masks(recording, "alpha", [frame.stamp_ns for frame in frames])
+    assert [true[frame.stamp_ns].shape for frame in frames] == [(48, 64)] * 2
+    assert 0 < np.mean([~mask for mask in true.values()]) < 0.9
+
+
 def test_stereo_depth_is_as_good_as_its_sigma_says(folder, stage, tmp_path):
     simulate(
         tmp_path / "rec", scene=str(folder), robots=1, frames=2, size=(320, 240), workers=1, rig=Rig("stereo")
@@ -182,6 +203,7 @@ def test_twists_lead_to_the_next_pose():
         {"rig": Rig(clock_s=2.0)},
         {"rig": Rig(camera_stops=3.0)},
         {"movers": 20},
+        {"masks": False},
     ],
 )
 def test_sensors_that_cannot_be_are_refused(tmp_path, bad):
