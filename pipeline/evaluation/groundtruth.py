@@ -115,6 +115,18 @@ class Surface:
         A disc is as wide as the points are apart, and the nearest disc counts, so that the distance is not blurred
         by the sampling.
         """
+        index, _, distance = self._nearest_disc(queries)
+        return distance, self.normals[index]
+
+    def nearest(self, queries: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Queries [m, 3], each moved along the normal into the plane of the disc that is nearest to it."""
+        index, across, _ = self._nearest_disc(queries)
+        return queries - across[:, None] * self.normals[index]
+
+    def _nearest_disc(
+        self, queries: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Index of the nearest disc [m], and the distances from its plane, with their sign, and from the disc."""
         tree, radius_m = self._discs
         neighbors = min(NEIGHBORS, len(self.points))
         _, index = tree.query(queries, k=neighbors)
@@ -124,8 +136,8 @@ class Surface:
         along = np.sqrt(np.maximum(np.sum(offset**2, axis=2) - across**2, 0.0))
         distance = np.hypot(across, np.maximum(along - radius_m, 0.0))
         best = np.argmin(distance, axis=1)[:, None]
-        nearest = np.take_along_axis(index, best, 1)[:, 0]
-        return np.take_along_axis(distance, best, 1)[:, 0], self.normals[nearest]
+        found, plane, away = (np.take_along_axis(each, best, 1)[:, 0] for each in (index, across, distance))
+        return found, plane, away
 
     @cached_property
     def _discs(self) -> tuple[Any, float]:

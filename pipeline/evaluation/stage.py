@@ -143,7 +143,7 @@ def evaluate(
         "rendering": rendering.team,
         "calibration": _calibration_section(source, of_robots, rows),
         "exchange": session.exchange_section(),
-        "consensus": session.consensus_section(),
+        "consensus": session.consensus_section() | _matching_section(run, source, truth, session),
         "protocol": PROTOCOL | {"views": f"at most {most_views} of a set, evenly spread"},
     }
     metrics, reasons = split_reasons(tree)
@@ -239,6 +239,17 @@ def _mean_or_sum(name: str, values: list[float | Absent]) -> float | Absent:
         counts = [v for v in values if not isinstance(v, Absent)]
         return int(math.fsum(counts)) if counts else values[0]
     return mean(values)
+
+
+def _matching_section(
+    run: RunFolder, source: Recording, truth: TruePaths, session: Session
+) -> dict[str, float | Absent]:
+    """Matches next to the true surface, if asked for."""
+    if not run.config.evaluation.matching:
+        return {}
+    from duagc.pipeline.evaluation.matching_truth import matching_section
+
+    return matching_section(run, source, truth, session.pairs)
 
 
 # --- the long table ----------------------------------------------------------------------------------------------

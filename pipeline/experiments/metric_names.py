@@ -28,7 +28,7 @@ _EXCHANGE = (
 )
 _CONSENSUS = (
     "rounds_to_tolerance gap_to_oracle_m gap_to_oracle_rad gap_to_oracle_sigma gap_to_oracle_sigma_p99 "
-    "rejected_matches_share"
+    "rejected_matches_share matching_precision matching_recall"
 )
 _CALIBRATION = (
     "ece_paper ece_rank ece_rank_if_right ece_rank_shuffled spearman ause nll coverage_95 nll_scaled "
@@ -57,8 +57,16 @@ def _known() -> Iterator[str]:
 KNOWN = tuple(_known())
 """Every name, as in `results.parquet`; `robots.*` is the mean over the robots."""
 
-_OF_SURFACE = ("calibration.*",)
-_OF_TRUTH = ("*.ate_*", "*.rpe_*", "*_of_truth", "*.frames_with_truth", "calibration.*", "*.depth_l1_exact_m")
+_OF_SURFACE = ("calibration.*", "consensus.matching_*")
+_OF_TRUTH = (
+    "*.ate_*",
+    "*.rpe_*",
+    "*_of_truth",
+    "*.frames_with_truth",
+    "calibration.*",
+    "*.depth_l1_exact_m",
+    "consensus.matching_*",
+)
 
 
 def check_metric(name: str, where: str) -> None:

@@ -9,16 +9,20 @@ from inspect import signature
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.spatial import cKDTree
 
 from duagc.pipeline.base import checkpoints
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.worker_reports import Step
 from duagc.pipeline.cli.runs import evaluate as evaluate_command
-from duagc.pipeline.evaluation import evaluate, robot_measures
+from duagc.pipeline.evaluation import evaluate, robot_measures, trajectory_errors
 from duagc.pipeline.evaluation import views as scored_views
+from duagc.pipeline.evaluation.matching_truth import matching_section
 from duagc.pipeline.evaluation.rendering import MOST_VIEWS
 from duagc.pipeline.evaluation.results import reason_of
+from duagc.pipeline.evaluation.true_paths import TruePaths
 from duagc.pipeline.experiments.own_longer import own_longer
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import LogWriter, Recording, read_log
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.schemas import topics
@@ -269,11 +273,14 @@ def test_own_maps_are_trained_longer_only_if_asked(metrics, tmp_path):
     assert {k: asked["rendering"][k] for k in others} == {k: metrics["rendering"][k] for k in others}
 
 
-def test_one_map_of_all_images_is_scored_only_if_asked(metrics, tmp_path):
+def test_one_map_of_all_images_and_true_matches_are_scored_only_if_asked(metrics, tmp_path):
     fake = make(tmp_path)
     settings = fake.run / "config.toml"
-    settings.write_text(settings.read_text() + "\n[evaluation]\ncentral_map = true\n")
+    settings.write_text(settings.read_text() + "\n[evaluation]\ncentral_map = true\nmatching = true\n")
     asked = evaluate(fake.run, fake.recording, progress=False)
+    of_matches = {name: asked["consensus"].pop(name) for name in ("matching_precision", "matching_recall")}
+    assert of_matches == dict.fromkeys(of_matches, 0.0)  # the pairs of this run are made up
+    assert asked["consensus"] == metrics["consensus"]
     assert "central" not in metrics["rendering"]
     central, own = asked["rendering"].pop("central"), asked["rendering"]["own"]
     assert central["team"]["views"] == own["team"]["views"] > 0
@@ -281,6 +288,32 @@ def test_one_map_of_all_images_is_scored_only_if_asked(metrics, tmp_path):
     assert alpha["peers"] == bravo["held_out"] != alpha["held_out"]  # it is one map
     assert central["held_out"]["psnr_db"] != own["held_out"]["psnr_db"]
     assert asked["rendering"] == metrics["rendering"]
+
+
+def test_matches_are_right_where_both_means_are_of_one_true_place(fake):
+    run, source = RunFolder(fake.run), Recording(fake.recording)
+    truth = TruePaths.of(run, source)
+    alpha, bravo = (
+        se3.transform(
+            trajectory_errors.alignment([truth.before[name]]),
+            run.robots[name].own_map.gaussians.means.astype(float),
+        )
+        for name in ("alpha", "bravo")
+    )
+    distance, index = cKDTree(bravo).query(alpha)
+    near = np.flatnonzero(distance < 0.01)
+    ids = [run.robots[name].own_map.gaussians.ids for name in ("alpha", "bravo")]
+    good = np.stack([ids[0][near], ids[1][index[near]]], axis=1)
+    half = good[::2]
+
+    def score(matched: np.ndarray) -> tuple[float, float]:
+        return tuple(matching_section(run, source, truth, {("alpha", "bravo"): matched}).values())
+
+    assert score(good)[0] == score(half)[0] == 1.0
+    assert score(half)[1] == pytest.approx(score(good)[1] / 2, rel=0.01)
+    assert 0 < score(half)[1] <= 0.5
+    wrong = np.stack([half[:, 0], np.roll(half[:, 1], len(half) // 2)], axis=1)
+    assert max(score(wrong)) < 0.1
 
 
 def test_without_ground_truth_there_are_reasons_not_numbers(tmp_path):

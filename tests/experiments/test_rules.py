@@ -120,7 +120,7 @@ def test_the_known_metrics_are_those_of_a_run() -> None:
     golden = json.loads((ROOT / "tests" / "golden" / "demo.json").read_text(encoding="utf-8"))["metrics"]
     numbers = {name: value for name, value in golden.items() if isinstance(value, int | float)}
     absent = {name for name in KNOWN if not names_in(name, golden)}
-    on_request = {name for name in KNOWN if name.startswith("rendering.central.")}
+    on_request = {name for name in KNOWN if name.startswith(("rendering.central.", "consensus.matching_"))}
     assert absent == on_request != set()
     for section in ("team.", "exchange.", "calibration."):
         assert {name for name in numbers if name.startswith(section)} <= set(KNOWN)
