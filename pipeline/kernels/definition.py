@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels.types import LossWeights
@@ -108,6 +109,47 @@ def project(
     x, y, z = places[order].unbind(-1)
     centers = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
     return order, z, centers, torch.linalg.inv(C[small])
+
+
+def screen_of(
+    means: Any,
+    covariances: Any,
+    opacity_logits: Any,
+    colors: Any,
+    *,
+    W: Any,
+    t: Any,
+    camera: PinholeCamera,
+    depth_kind: DepthKind,
+) -> tuple[Any, Screen, Any]:
+    """What Gaussians are on the screen of a camera.
+
+    Args:
+        means: [n, 3], in the frame `map`.
+        covariances: [n, 3, 3].
+        opacity_logits: [n].
+        colors: [n, 3].
+        W: rotation [3, 3] of T_camera_map, or one for each Gaussian.
+        t: translation [3], or one for each Gaussian.
+        camera: that sees them.
+        depth_kind: depth of a Gaussian at a pixel, see above.
+    Returns:
+        Indices [k] of those in front of the camera, nearest first, their `Screen`, and how far [k] they are from where
+        J is clamped (`linearized`).
+    """
+    import torch
+
+    n = len(means)
+    W, t = W.expand(n, 3, 3), t.expand(n, 3)
+    order, z, centers, conics = project(means, covariances, W, t, camera=camera)
+    places = (W @ means[..., None])[order, :, 0] + t[order]
+    JW, from_clamp = linearized(places, W[order], camera)
+    along_z = JW @ covariances[order] @ W[order, 2, :, None]  # k, covariance of screen position and depth
+    slopes = (conics @ along_z)[..., 0]
+    if depth_kind == "blended":
+        slopes = torch.zeros_like(slopes)
+    opacities = torch.sigmoid(opacity_logits)[order]
+    return order, Screen(centers, conics, z, slopes, opacities, colors[order]), from_clamp
 
 
 def linearized(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:

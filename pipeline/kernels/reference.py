@@ -28,10 +28,9 @@ from duagc.pipeline.kernels.definition import (
     columns_of,
     derivatives_by_inputs,
     hat,
-    linearized,
     matrix_exp,
     paint,
-    project,
+    screen_of,
     sigma_of,
     tensor,
     view_loss,
@@ -235,17 +234,18 @@ class ReferenceRasterizer:
         # T_map_camera exp(xi): the camera sees exp(-xi) p; first order is exact for derivatives at xi = 0
         turn = torch.eye(3, dtype=torch.float64) - hat(w)
         W, t = turn @ self._T[:3, :3], turn @ self._T[:3, 3] - v
-        order, z, centers, conics = project(p["means"], sigma, W, t, camera=camera)
-        self._order = order.numpy()
-        places = (W @ p["means"][..., None])[order, :, 0] + t[order]
-        JW, self._from_clamp = linearized(places, W[order], camera)
-        along_z = JW @ sigma[order] @ W[order, 2, :, None]  # k, covariance of screen position and depth
-        slopes = (conics @ along_z)[..., 0]
-        if self._depth_kind == "blended":
-            slopes = torch.zeros_like(slopes)
-        return Screen(
-            centers, conics, z, slopes, torch.sigmoid(p["opacity_logits"])[order], p["colors"][order]
+        order, screen, self._from_clamp = screen_of(
+            p["means"],
+            sigma,
+            p["opacity_logits"],
+            p["colors"],
+            W=W,
+            t=t,
+            camera=camera,
+            depth_kind=self._depth_kind,
         )
+        self._order = order.numpy()
+        return screen
 
     def _image(self, values: Any) -> NDArray[np.float64]:
         """Values [m, ...] of the drawn pixels as an image, zero elsewhere."""
