@@ -59,27 +59,11 @@ def run_information(
         DuagError: no map in the front end's log, or a keyframe that is held out or not in the sensor log.
     """
     front = read_frontend(frontend_path)
-    final, keyframes = front.final, front.keyframes
+    final = front.final
     with open_rgbd(log_path) as log:
         if log.robot != robot_of(final.robot):
             raise DuagError(f"{frontend_path}: has the map of {final.robot}, expected that of {log.robot}")
-        log.move_depth_by(frontend_path)
-        beyond = [k.frame_index for k in keyframes if k.frame_index >= len(log)]
-        if beyond:
-            raise DuagError(
-                f"{frontend_path}: {topics.KEYFRAME.of(final.robot)} names frame {beyond[0]}, "
-                f"expected less than the {len(log)} frames of {log_path.name}"
-            )
-        exposures = read_exposures(frontend_path, final.robot)
-
-        def posed(keyframe: Keyframe) -> PosedRgbd:
-            frame, T = log.frame(keyframe.frame_index), keyframe.T_map_camera
-            exposure = exposures.at(frame.index)
-            return PosedRgbd(frame.color, frame.depth, T, frame.mask, frame.depth_sigma, exposure)
-
-        images = ShelvedList(map(posed, keyframes))
-        free = free_space(images, log.camera, moving)
-        views = MapViews(final.gaussians, log.camera, without_moving(images, free), final.depth, threads)
+        views, free = own_views(log, front, frontend_path, moving, threads=threads)
         seen = chain(
             (DepthView(usable_depth(image), image.T_world_camera) for image in views.images),
             _depth_views(log, front.between(config.deviation_frames), free),
@@ -87,10 +71,51 @@ def run_information(
         deviation_m = surface_deviation(final.gaussians, log.camera, seen, config.deviation_gate_m)
     result = _information(views, final, config, thickness_floor_m=thickness_floor_m, deviation_m=deviation_m)
     # a message is copied while it is written: nothing else may be in memory then
-    del views, images, free, seen
+    del views, free, seen
     with LogWriter(out_path, robot=final.robot) as writer:
         writer.write(topics.INFORMATION.of(final.robot), result, front.log_time_ns)
     return result
+
+
+def own_views(
+    log: RgbdLog,
+    front: FrontEnd,
+    frontend_path: Path,
+    moving: MovingConfig,
+    *,
+    threads: SupportsIndex = 1,
+) -> tuple[MapViews, FreeSpace]:
+    """A robot's final map with the images of its keyframes, without what moved, and the space seen to be free.
+
+    Args:
+        log: the robot's sensor log, open.
+        front: what its front end ended with.
+        frontend_path: frontend.mcap, by which depth of another time is moved.
+        moving: as the front end looked for what moves.
+        threads: of the rasterizer.
+    Raises:
+        DuagError: a keyframe is not in the sensor log.
+    """
+    log.move_depth_by(frontend_path)
+    final = front.final
+    beyond = [k.frame_index for k in front.keyframes if k.frame_index >= len(log)]
+    if beyond:
+        raise DuagError(
+            f"{frontend_path}: {topics.KEYFRAME.of(final.robot)} names frame {beyond[0]}, "
+            f"expected less than the {len(log)} frames of {log.path.name}"
+        )
+    exposures = read_exposures(frontend_path, final.robot)
+
+    def posed(keyframe: Keyframe) -> PosedRgbd:
+        frame, T = log.frame(keyframe.frame_index), keyframe.T_map_camera
+        return PosedRgbd(
+            frame.color, frame.depth, T, frame.mask, frame.depth_sigma, exposures.at(frame.index)
+        )
+
+    images = ShelvedList(map(posed, front.keyframes))
+    free = free_space(images, log.camera, moving)
+    views = MapViews(final.gaussians, log.camera, without_moving(images, free), final.depth, threads)
+    return views, free
 
 
 def _information(
