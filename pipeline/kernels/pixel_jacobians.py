@@ -124,7 +124,7 @@ class PixelJacobians:
         for k, row in enumerate(order_of_some.tolist()):
             found = drawn.footprint(int(place[self._rows[row]]), usable)
             if found is not None:
-                yield Footprint(row, *found, by_parameters=by_parameters[k], by_chart=by_chart[k])
+                yield Footprint(row, **found, by_parameters=by_parameters[k], by_chart=by_chart[k])
 
     def _by_inputs(self, shared: dict[str, Any], *, chart: bool) -> tuple[NDArray[np.int64], Array]:
         """Indices [k] of the Gaussians asked for, nearest first, and derivatives [k, s, p] of their screen numbers."""
@@ -152,8 +152,8 @@ class _Drawn:
         half = np.stack([reach * np.sqrt(yy), reach * np.sqrt(xx)], axis=1) + 1e-6
         self._low, self._high = screen.centers - half, screen.centers + half
 
-    def footprint(self, k: int, usable: NDArray[np.bool_]) -> tuple[Any, ...] | None:
-        """Pixels, weights, center depth, images and derivatives of Gaussian k of the screen; None: no pixel."""
+    def footprint(self, k: int, usable: NDArray[np.bool_]) -> dict[str, Any] | None:
+        """What a `Footprint` says of Gaussian k of the screen, without its inputs; None: no pixel draws it."""
         if not self._power[k] > 0:
             return None
         size = np.array([self._camera.width, self._camera.height])
@@ -165,19 +165,14 @@ class _Drawn:
         pixels = np.argwhere(part)[:, ::-1] + first
         pixels = pixels[self._raw(pixels, np.array([k]))[0][:, 0] >= ALPHA_MIN]
         blocks = pixels // BLOCK_PX
-        parts = []
-        for block in np.unique(blocks, axis=0):
-            some = pixels[(blocks == block).all(axis=1)]
-            parts.append(self._block(k, some))
-        parts = [part for part in parts if len(part[0])]
-        if not parts:
+        parts = [self._block(k, pixels[(blocks == b).all(axis=1)]) for b in np.unique(blocks, axis=0)]
+        if not any(len(part["pixels"]) for part in parts):
             return None
-        joined = [np.concatenate(arrays) for arrays in zip(*(part[:-1] for part in parts), strict=True)]
-        by_screen = np.concatenate([part[-1] for part in parts], axis=1)
-        pixels, weights, color, depth, alpha = joined
-        return pixels, weights, float(self.screen.depths[k]), color, depth, alpha, by_screen
+        joined: dict[str, Any] = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+        joined["by_screen"] = joined["by_screen"].swapaxes(0, 1)
+        return {**joined, "depth_m": float(self.screen.depths[k])}
 
-    def _raw(self, pixels: Array, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    def _raw(self, pixels: NDArray[np.int64], rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
         """Alpha before its clamp [m, k] of Gaussians at pixels, and the pixels from their centers in x and y."""
         x = pixels[:, :1] - self.screen.centers[rows, 0]
         y = pixels[:, 1:] - self.screen.centers[rows, 1]
@@ -185,8 +180,8 @@ class _Drawn:
         power = Q[:, 0, 0] * x * x + 2 * Q[:, 0, 1] * x * y + Q[:, 1, 1] * y * y
         return self.screen.opacities[rows] * np.exp(-0.5 * power), x, y
 
-    def _block(self, k: int, pixels: NDArray[np.int64]) -> tuple[Array, ...]:
-        """Those of the pixels that draw Gaussian k: pixels, weights, color, depth, alpha, derivatives."""
+    def _block(self, k: int, pixels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """The pixels that draw Gaussian k, of some near each other: `footprint`, pixels first in all arrays."""
         low, high = pixels.min(axis=0), pixels.max(axis=0)
         inside = (self._low <= high) & (self._high >= low)
         rows = np.flatnonzero(inside.all(axis=1) & (self._power > 0))
@@ -209,7 +204,6 @@ class _Drawn:
         )
         kept = a[:, j] > 0
         moving = raw[:, j] * (raw[:, j] <= ALPHA_MAX)
-        out = np.zeros((4, len(pixels), SCREEN_NUMBERS))
         dx, dy, Q = x[:, j], y[:, j], s.conics[k]
         of_alpha = np.zeros((len(pixels), SCREEN_NUMBERS))  # of a by the screen numbers
         of_alpha[:, 0] = moving * (Q[0, 0] * dx + Q[0, 1] * dy)
@@ -218,13 +212,19 @@ class _Drawn:
             -0.5 * moving[:, None] * np.stack([dx * dx, 2 * dx * dy, 0 * dx, dy * dy], axis=1)
         )
         of_alpha[:, _OPACITY] = moving / s.opacities[k]
-        out += by_alpha[:, :, None] * of_alpha
+        out = by_alpha[:, :, None] * of_alpha
         weight = w[:, j]
         for channel in range(3):
             out[channel, :, _COLOR.start + channel] += weight
         out[3, :, _DEPTH] += weight
         out[3, :, _SLOPE] += weight[:, None] * np.stack([dx, dy], axis=1)
         out[3, :, _CENTER] -= weight[:, None] * s.slopes[k]
-        color, depth = np.stack(images[:3], axis=1), images[3]
-        found = pixels, weight, color, depth, w.sum(axis=1)
-        return *(array[kept] for array in found), out[:, kept]
+        found = {
+            "pixels": pixels,
+            "weights": weight,
+            "color": np.stack(images[:3], axis=1),
+            "depth": images[3],
+            "alpha": w.sum(axis=1),
+            "by_screen": out.swapaxes(0, 1),
+        }
+        return {name: array[kept] for name, array in found.items()}
