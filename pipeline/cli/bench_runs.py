@@ -1,4 +1,4 @@
-"""Commands that measure whole runs: for every second of log, and as logs get longer."""
+"""Commands that measure whole runs: for every second of log, as logs get longer, and what they state."""
 
 import json
 from pathlib import Path
@@ -84,3 +84,57 @@ def bench_length(
     lengths = tuple(numbers("--seconds", seconds, 0.1, 1e6))
     result = length.run(length.LengthPlan(recording, lengths, threads, tuple(_options(overrides)), keep))
     print(json.dumps(result, indent=2) if as_json else length.format_table(result))
+
+
+@bench_app.command("information")
+def bench_information(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A finished run.", show_default=False)],
+    recording: Annotated[
+        Path | None, typer.Option(help="Folder of its recording, if it moved.", show_default=False)
+    ] = None,
+    sample: Annotated[int, typer.Option(min=1, help="Gaussians of each robot, drawn at random.")] = 400,
+    windows: Annotated[str, typer.Option(help="Numbers of keyframes K to sum over.")] = "1,2,4,8,10",
+    robot: Annotated[str | None, typer.Option(help="One robot; all by default.", show_default=False)] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the sample.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write, which must not exist: information.json, gaussians.parquet, r_k.svg.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What the information of single Gaussians is like: cross terms, windows, squared gradients; verdicts by rules.
+
+    Sums derivatives of single pixels in float64 over the run's own keyframes; opens no ground truth. 400 Gaussians
+    take some minutes a robot.
+
+    Example: `duagc bench information outputs/redkitchen --out outputs/information`
+    """
+    from duagc.pipeline.base import determinism
+    from duagc.pipeline.base.errors import DuagError
+    from duagc.pipeline.base.files import new_file
+    from duagc.pipeline.experiments import information_structure, information_tables
+    from duagc.pipeline.recording import Recording
+    from duagc.pipeline.runs.folder import RunFolder
+
+    determinism.configure_opencv()
+    if out is not None and out.exists():
+        raise DuagError(f"{out}: exists, expected a new folder")
+    run = RunFolder(run_folder)
+    source = Recording(run.recording if recording is None else recording)
+    plan = information_structure.StructurePlan(
+        sample, tuple(counts("--windows", windows)), robots=(robot,) if robot else (), seed=seed
+    )
+    found = information_structure.run(run, source, plan)
+    text = json.dumps(information_tables.numbers(found), indent=2)
+    if out is not None:
+        out.mkdir(parents=True)
+        for name, content in (("information.json", f"{text}\n"), ("r_k.svg", information_tables.plot(found))):
+            with new_file(out / name) as part:
+                part.write_text(content, encoding="utf-8")
+        information_structure.write_gaussians(found.columns, out / "gaussians.parquet")
+    print(text if as_json else information_tables.format_tables(found))

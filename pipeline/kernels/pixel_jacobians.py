@@ -165,7 +165,10 @@ class _Drawn:
         pixels = np.argwhere(part)[:, ::-1] + first
         pixels = pixels[self._raw(pixels, np.array([k]))[0][:, 0] >= ALPHA_MIN]
         blocks = pixels // BLOCK_PX
-        parts = [self._block(k, pixels[(blocks == b).all(axis=1)]) for b in np.unique(blocks, axis=0)]
+        near = self._reaching(first, last, np.arange(len(self.order)))
+        parts = [
+            self._block(k, pixels[(blocks == block).all(axis=1)], near) for block in np.unique(blocks, axis=0)
+        ]
         if not any(len(part["pixels"]) for part in parts):
             return None
         joined: dict[str, Any] = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
@@ -180,11 +183,16 @@ class _Drawn:
         power = Q[:, 0, 0] * x * x + 2 * Q[:, 0, 1] * x * y + Q[:, 1, 1] * y * y
         return self.screen.opacities[rows] * np.exp(-0.5 * power), x, y
 
-    def _block(self, k: int, pixels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """The pixels that draw Gaussian k, of some near each other: `footprint`, pixels first in all arrays."""
-        low, high = pixels.min(axis=0), pixels.max(axis=0)
-        inside = (self._low <= high) & (self._high >= low)
-        rows = np.flatnonzero(inside.all(axis=1) & (self._power > 0))
+    def _reaching(self, low: Array, high: Array, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of the Gaussians that may be drawn between two pixels [2]."""
+        below, above = self._low[rows], self._high[rows]
+        inside = (below[:, 0] <= high[0]) & (below[:, 1] <= high[1])
+        inside &= (above[:, 0] >= low[0]) & (above[:, 1] >= low[1])
+        return rows[inside & (self._power[rows] > 0)]
+
+    def _block(self, k: int, pixels: NDArray[np.int64], near: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """The pixels that draw Gaussian k, of some close together: `footprint`, pixels first in all arrays."""
+        rows = self._reaching(pixels.min(axis=0), pixels.max(axis=0), near)
         raw, x, y = self._raw(pixels, rows)
         a = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0.0)
         left = np.cumprod(1 - a, axis=1)
