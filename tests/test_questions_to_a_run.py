@@ -152,10 +152,12 @@ def test_the_whole_information_of_its_gaussians(small_run: Path, tmp_path: Path)
     assert verdicts["last_ten_keyframes"] == "not testable"
     assert (found.columns["sigma_normal"] >= 1 - 1e-6).all()
     assert (found.columns["stated_normal"] >= 1 - 1e-3).all()
-    numbers = json.loads(json.dumps(information_tables.numbers(found), allow_nan=False))
+    code = information_structure.code_digest()
+    assert len(code) == 64
+    numbers = json.loads(json.dumps(information_tables.numbers(found, code), allow_nan=False))
     assert numbers["measures"]["rolling_50"]["50"] is None
     assert numbers["measures"]["rolling_1"]["50"] is None or numbers["measures"]["rolling_1"]["50"] >= 1
-    assert "| mean, shape |" in information_tables.format_tables(found)
+    assert "mean, shape |" in information_tables.page(found, code)
     assert information_tables.plot(found).count("</svg>") == 1
     information_structure.write_gaussians(found.columns, tmp_path / "gaussians.parquet")
     assert (tmp_path / "gaussians.parquet").stat().st_size > 1000

@@ -101,7 +101,8 @@ def bench_information(
         typer.Option(
             "--out",
             "-o",
-            help="Folder to write, which must not exist: information.json, gaussians.parquet, r_k.svg.",
+            help="Folder to write, which must not exist: information.md, information.json, gaussians.parquet, "
+            "r_k.svg.",
             show_default=False,
         ),
     ] = None,
@@ -130,10 +131,15 @@ def bench_information(
         sample, tuple(counts("--windows", windows)), robots=(robot,) if robot else (), seed=seed
     )
     found = information_structure.run(run, source, plan)
-    text = json.dumps(information_tables.numbers(found), indent=2)
+    code = information_structure.code_digest()
+    text = json.dumps(information_tables.numbers(found, code), indent=2)
     if out is not None:
         out.mkdir(parents=True)
-        for name, content in (("information.json", f"{text}\n"), ("r_k.svg", information_tables.plot(found))):
+        for name, content in (
+            ("information.json", f"{text}\n"),
+            ("information.md", information_tables.page(found, code)),
+            ("r_k.svg", information_tables.plot(found)),
+        ):
             with new_file(out / name) as part:
                 part.write_text(content, encoding="utf-8")
         information_structure.write_gaussians(found.columns, out / "gaussians.parquet")

@@ -12,10 +12,13 @@
     stated_normal     the same of the deviations that a robot states, after what it measured is added
     stated_weight     trace of the stated information of the mean, without cross terms over with
     rolling_K         deviation along the normal, by its own block, from the last K keyframes over that from all
-    latest_K          the same from the last K keyframes that saw the Gaussian
+    latest_K          the same from the last K keyframes that saw the Gaussian; `r_latest_K`: `r_chart` of these
     squared_gradients mean generalized eigenvalue of (2) and J^T R^-1 J over the directions that the latter knows;
-                      `_least` and `_most`: the extremes; `_normal`: of the mean's blocks, along the normal; `_color`:
-                      of the color alone, as (2) is printed
+                      `_least` and `_most`: the extremes; `_trace`: mean over the diagonal of the one entry over the
+                      other; `_normal`: of the mean's blocks, along the normal; `_color`: of the color alone, as (2) is
+                      printed
+    normal_m          deviation of the mean along the normal, by its own block, of the covered pixels; `normal_m_color`
+                      of the color alone; `squared_m`, `squared_m_color`: the same by (2)
 
 Everything is one number for each Gaussian; infinite where nothing is known, NaN where there is nothing to compare.
 """
@@ -98,15 +101,23 @@ def measures(
     for kind, windows in (("rolling", sums.rolling), ("latest", sums.latest)):
         for K, F in windows.items():
             out[f"{kind}_{K}"] = _over(_sigma(F[:, MEAN, MEAN], normal[:, None, :]), of_all)
+            if kind == "latest":
+                out[f"r_latest_{K}"] = off_diagonal(unit_diagonal(F), OF_CHART)
 
-    for name, squared, covered in (
-        ("squared_gradients", sums.squared, sums.covered),
-        ("squared_gradients_color", sums.squared_color, sums.covered_color),
+    for end, squared, covered in (
+        ("", sums.squared, sums.covered),
+        ("_color", sums.squared_color, sums.covered_color),
     ):
-        values = generalized_eigenvalues(squared, covered)
-        out[name], out[f"{name}_least"], out[f"{name}_most"] = values.T
+        name = f"squared_gradients{end}"
+        out[name], out[f"{name}_least"], out[f"{name}_most"] = generalized_eigenvalues(squared, covered).T
+        diagonals = [np.diagonal(F, axis1=1, axis2=2) for F in (squared, covered)]
+        entries = _over(*diagonals)
+        counted = np.maximum((~np.isnan(entries)).sum(axis=1), 1)
+        out[f"{name}_trace"] = np.where(np.isnan(out[name]), np.nan, np.nansum(entries, axis=1) / counted)
         along = [np.einsum("ni,nij,nj->n", normal, F[:, MEAN, MEAN], normal) for F in (squared, covered)]
         out[f"{name}_normal"] = _over(*along)
+        for kind, F in (("squared_m", squared), ("normal_m", covered)):
+            out[f"{kind}{end}"] = _sigma(F[:, MEAN, MEAN], normal[:, None, :])
     return out
 
 

@@ -7,6 +7,7 @@ A random sample of the Gaussians of every robot's own map, of a finished run. Th
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import new_file, read_bytes
+from duagc.pipeline.cache.code_identity import CodeReader
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.experiments.information_blocks import BlockSums, sum_blocks
 from duagc.pipeline.experiments.information_measures import measures
@@ -122,6 +124,9 @@ def run(folder: RunFolder, source: Recording, plan: StructurePlan) -> Structure:
     rules = InformationRules.model_validate(tomllib.loads(data.decode()))
     summary = {
         "schema": SCHEMA,
+        "question": rules.question,
+        "claim": rules.claim,
+        "limits": rules.limits,
         "run": folder.path.name,
         "recording": source.name,
         "rules_sha256": hashlib.sha256(data).hexdigest(),
@@ -171,7 +176,9 @@ def _of_robot(
     }
     for K in plan.windows:
         if keyframes <= K:  # all of them: nothing to compare
-            columns |= {f"{kind}_{K}": np.full(len(rows), np.nan) for kind in ("rolling", "latest")}
+            columns |= {
+                f"{kind}_{K}": np.full(len(rows), np.nan) for kind in ("rolling", "latest", "r_latest")
+            }
     return facts, {key: column[seen] for key, column in columns.items()}
 
 
@@ -263,6 +270,12 @@ def wilson(share: float, count: int) -> tuple[float, float]:
     middle = (share + z2 / 2) / (1 + z2)
     half = Z_95 / (1 + z2) * math.sqrt(share * (1 - share) / count + z2 / (4 * count))
     return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def code_digest() -> str:
+    """SHA-256 of the code that everything here is computed by."""
+    modules = CodeReader().version_of(f"{__name__}:run").modules
+    return hashlib.sha256(json.dumps(modules, sort_keys=True).encode()).hexdigest()
 
 
 def write_gaussians(columns: Mapping[str, NDArray[Any]], path: Path) -> None:

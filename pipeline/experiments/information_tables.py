@@ -36,25 +36,29 @@ SQUARED = {
     "squared_gradients": "mean",
     "squared_gradients_least": "least",
     "squared_gradients_most": "largest",
+    "squared_gradients_trace": "mean of the diagonal",
     "squared_gradients_normal": "mean's block, along the normal",
     "squared_gradients_color": "color alone: mean",
+    "squared_gradients_color_trace": "color alone: mean of the diagonal",
     "squared_gradients_color_normal": "color alone: along the normal",
 }
 OF_STRATA = ("r_unit_diagonal", "mean_shape", "sigma_normal", "stated_normal", "squared_gradients")
 SHARES = (0.1, 0.5, 0.9, 0.99)
 
 
-def numbers(found: Structure) -> dict[str, Any]:
+def numbers(found: Structure, code: str) -> dict[str, Any]:
     """All tables as JSON; what is infinite or unknown is null.
 
     Args:
         found: of `information_structure.run`.
+        code: digest of the code.
     """
     c = found.columns
     names = [*RATIOS, *("_".join(pair) for pair in PAIRS), *COSTS, *SQUARED]
-    names += [f"{kind}_{K}" for kind in ("rolling", "latest") for K in found.summary["windows"]]
+    names += [f"{kind}_{K}" for kind in ("rolling", "latest", "r_latest") for K in found.summary["windows"]]
     tree = {
         **found.summary,
+        "code_sha256": code,
         "measures": {name: _quantiles(c[name]) for name in names},
         "strata": {
             stratum: [
@@ -74,16 +78,22 @@ def numbers(found: Structure) -> dict[str, Any]:
 
 
 def ranks(found: Structure) -> dict[str, float]:
-    """Rank correlations of what squared gradients say over what the information says.
+    """Rank correlations over the Gaussians: of (2) over the information with the residual, and of the two.
 
     Args:
         found: of `information_structure.run`.
     """
     c = found.columns
+    pairs = {
+        "(2) over J^T R^-1 J, color residual": ("squared_gradients", "residual"),
+        "(2) of the color alone over its J^T R^-1 J, color residual": ("squared_gradients_color", "residual"),
+        "deviations along the normal by (2) and by J^T R^-1 J": ("squared_m", "normal_m"),
+        "the same of the color alone": ("squared_m_color", "normal_m_color"),
+    }
     out = {}
-    for name in ("squared_gradients", "squared_gradients_color"):
-        known = np.isfinite(c[name])
-        out[f"{name}, residual"] = spearman(c[name][known], c["residual"][known])
+    for name, (a, b) in pairs.items():
+        known = np.isfinite(c[a]) & np.isfinite(c[b])
+        out[name] = spearman(c[a][known], c[b][known])
     return out
 
 
@@ -95,7 +105,15 @@ def format_tables(found: Structure) -> str:
     """
     c, summary = found.columns, found.summary
     parts = [
-        *(_facts(name, facts) for name, facts in summary["robots"].items()),
+        "\n".join(_facts(name, facts) for name, facts in summary["robots"].items()),
+        "Rules: share of the Gaussians for which they are met, with its 95 % interval (Wilson).",
+        _table(
+            ["rule", "met by", "verdict"],
+            [
+                [f"{'control: ' * v['control']}{v['claim']}", v["why"], f"**{v['verdict']}**"]
+                for v in summary["verdicts"]
+            ],
+        ),
         "Off-diagonal blocks: share of the norm (r_k) by percentile of the Gaussians, and how many are within 0.1.",
         _table(
             ["r_k", *_heads(), "<= 0.1, %"],
@@ -132,26 +150,54 @@ def format_tables(found: Structure) -> str:
         ),
         "Windows: deviation along the normal over that from all keyframes, and Gaussians that the window knows.",
         _table(
-            ["K", "last K: known, %", "50 %", "90 %", "last K that saw it: 50 %", "90 %"],
+            ["K", "last K: known, %", "50 %", "90 %", "last K that saw it: 50 %", "90 %", "their r_k: 50 %"],
             [
                 [
                     str(K),
                     _percent(np.isfinite(c[f"rolling_{K}"])),
                     *_cells(c[f"rolling_{K}"], (0.5, 0.9)),
                     *_cells(c[f"latest_{K}"], (0.5, 0.9)),
+                    *_cells(c[f"r_latest_{K}"], (0.5,)),
                 ]
                 for K in summary["windows"]
             ],
         ),
         "Squared gradients (2) over J^T R^-1 J: generalized eigenvalues.",
         _table(["eigenvalue", *_heads()], [[title, *_cells(c[name])] for name, title in SQUARED.items()]),
-        "\n".join(f"- rank correlation of {name}: {value:.2f}" for name, value in ranks(found).items()),
-        "\n".join(
-            f"- {'control' if v['control'] else 'rule'} {v['name']}: {v['verdict']} ({v['why']}). {v['claim']}"
-            for v in summary["verdicts"]
-        ),
+        "\n".join(f"- rank correlation, {name}: {value:.2f}" for name, value in ranks(found).items()),
     ]
     return "\n\n".join(parts)
+
+
+def page(found: Structure, code: str) -> str:
+    """The tables as a page of the documentation.
+
+    Args:
+        found: of `information_structure.run`.
+        code: digest of the code.
+    """
+    s = found.summary
+    windows = ",".join(map(str, s["windows"]))
+    return f"""---
+kind: results
+generated: true
+---
+# Information of single Gaussians
+
+{s["question"]}
+{s["claim"]}
+Not shown: {s["limits"]}
+
+```text
+duagc bench information RUN --sample {s["sample"]} --windows {windows} --seed {s["seed"]} --out DIR
+```
+
+Recording {s["recording"]}, rules `{s["rules_sha256"][:12]}`, code `{code[:12]}`; this page is its `information.md`.
+Measures are defined in `pipeline/experiments/information_measures.py`.
+A control is a claim known to be false, which must fail.
+
+{format_tables(found)}
+"""
 
 
 def plot(found: Structure) -> str:
