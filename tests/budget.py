@@ -32,7 +32,7 @@ BUDGET_S = {
     "evaluation": 11,
     "examples": 15,
     "exchange": 36,
-    "experiments": 3,
+    "experiments": 4,
     "frontend": 72,
     "fusion": 2,
     "fuzz": 10,
