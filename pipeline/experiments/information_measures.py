@@ -1,4 +1,4 @@
-"""Measures of the information of single Gaussians: what lies off its blocks, what that costs, and (2) beside it.
+"""Measures of the information of single Gaussians: what lies off its blocks, what that costs, and how (2) differs.
 
     r_meters          norm of the off-diagonal blocks of the 14x14 over that of the whole (Frobenius), SI units; blocks:
                       mean, quaternion, log-scales, color, logit

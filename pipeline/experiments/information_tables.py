@@ -146,7 +146,7 @@ def format_tables(found: Structure) -> str:
                 "90 %",
                 "squared gradients",
             ],
-            [_stratum(stratum, *third, found) for stratum in STRATA for third in thirds(c[stratum])],
+            [_stratum(stratum, *third, found=found) for stratum in STRATA for third in thirds(c[stratum])],
         ),
         "Windows: deviation along the normal over that from all keyframes, and Gaussians that the window knows.",
         _table(
@@ -223,7 +223,7 @@ def _facts(name: str, facts: dict[str, Any]) -> str:
     )
 
 
-def _stratum(name: str, low: float, high: float, part: NDArray[np.bool_], found: Structure) -> list[str]:
+def _stratum(name: str, low: float, high: float, part: NDArray[np.bool_], *, found: Structure) -> list[str]:
     c = {measure: found.columns[measure][part] for measure in OF_STRATA}
     return [
         name,
