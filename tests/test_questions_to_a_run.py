@@ -11,12 +11,7 @@ from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.session import run_session
-from duagc.pipeline.experiments import (
-    information_structure,
-    information_tables,
-    pose_reference,
-    team_faults,
-)
+from duagc.pipeline.experiments import pose_reference, team_faults
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.steps import agent_input
@@ -136,31 +131,3 @@ def test_a_signed_packet_can_be_asked_for(small_run: Path, small_recording: Path
     assert facts["bytes"] == 34 + 8 + 1100 + 64
     state = next(k for k, p in enumerate(packets) if p.kind_name == "STATE")
     assert inspector.packet(state)["content"]["bytes_of_poses"] == 0
-
-
-def test_the_whole_information_of_its_gaussians(small_run: Path, tmp_path: Path) -> None:
-    """The sums are those that the stage wrote, and tables, plot and rows are made of them."""
-    run = RunFolder(small_run)
-    plan = information_structure.StructurePlan(12, (1, 50), robots=("alpha",))
-    found = information_structure.run(run, Recording(run.recording), plan)
-    facts = found.summary["robots"]["alpha"]
-    assert max(facts["difference_from_stage"].values()) < 2e-3
-    assert facts["views_that_differ"] == 0
-    assert len(found.columns["id"]) == facts["seen"] > 6
-    verdicts = {v["name"]: v["verdict"] for v in found.summary["verdicts"]}
-    assert verdicts["turned"] == "fails"
-    assert verdicts["last_ten_keyframes"] == "not testable"
-    assert (found.columns["sigma_normal"] >= 1 - 1e-6).all()
-    assert (found.columns["stated_normal"] >= 1 - 1e-3).all()
-    code = 64 * "a"
-    numbers = json.loads(json.dumps(information_tables.numbers(found, code), allow_nan=False))
-    assert numbers["measures"]["rolling_50"]["50"] is None
-    assert numbers["measures"]["rolling_1"]["50"] is None or numbers["measures"]["rolling_1"]["50"] >= 1
-    assert "mean, shape |" in information_tables.page(found, code)
-    assert information_tables.plot(found).count("</svg>") == 1
-    information_structure.write_gaussians(found.columns, tmp_path / "gaussians.parquet")
-    assert (tmp_path / "gaussians.parquet").stat().st_size > 1000
-    with pytest.raises(DuagError, match="has no robot zulu"):
-        information_structure.run(
-            run, Recording(run.recording), information_structure.StructurePlan(robots=("zulu",))
-        )

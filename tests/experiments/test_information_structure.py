@@ -1,20 +1,28 @@
 """The information of single Gaussians with its cross terms: sums, measures, verdicts."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
 from duagc.pipeline.experiments import information_measures as m
+from duagc.pipeline.experiments import information_structure, information_tables
 from duagc.pipeline.experiments.information_blocks import BlockSums, sum_blocks
 from duagc.pipeline.experiments.information_structure import ShareRule, _verdict, thirds, wilson
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.information.noise import ImageNoise
+from duagc.pipeline.information.stage import run_information
 from duagc.pipeline.information.sums import sum_information, without_thickness
 from duagc.pipeline.information.views import MapViews
+from duagc.pipeline.recording import Recording
+from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.splat.information import unpack_geometry
+from tests.fixtures.fake_run import make
 from tests.fixtures.noisy_wall import CAMERA, NOISE, SENSOR, views_of, wall
 
 ROWS = np.array([5, 40, 111, 222, 333, 444, 599])
@@ -102,3 +110,39 @@ def test_a_share_holds_fails_or_is_open() -> None:
 def test_thirds_keep_equal_values_together() -> None:
     parts = thirds(np.array([1.0, 1, 1, 1, 2, 3]))
     assert [(low, high, int(part.sum())) for low, high, part in parts] == [(1, 1, 4), (2, 3, 2)]
+
+
+def test_the_information_of_a_runs_gaussians(tmp_path: Path) -> None:
+    """The sums are those that the stage wrote, and tables, plot and rows are made of them."""
+    made = make(tmp_path)
+    run, source = RunFolder(made.run), Recording(made.recording)
+    folder = run.robots["alpha"].folder
+    run_information(
+        source.log("alpha"),
+        folder / "frontend.mcap",
+        folder / "information.mcap",
+        config=run.config.information,
+        moving=run.config.frontend.moving,
+        thickness_floor_m=run.config.frontend.mapping.seeding.thickness_m,
+    )
+    plan = information_structure.StructurePlan(30, (1, 50), robots=("alpha",))
+    found = information_structure.run(run, source, plan)
+    facts = found.summary["robots"]["alpha"]
+    assert max(facts["difference_from_stage"].values()) < 2e-3
+    assert facts["views_that_differ"] == 0
+    assert len(found.columns["id"]) == facts["seen"] > 6
+    verdicts = {v["name"]: v["verdict"] for v in found.summary["verdicts"]}
+    assert verdicts["turned"] == "fails"
+    assert verdicts["last_ten_keyframes"] == "not testable"
+    assert (found.columns["sigma_normal"] >= 1 - 1e-6).all()
+    assert (found.columns["stated_normal"] >= 1 - 1e-3).all()
+    code = 64 * "a"
+    numbers = json.loads(json.dumps(information_tables.numbers(found, code), allow_nan=False))
+    assert numbers["measures"]["rolling_50"]["50"] is None
+    assert numbers["measures"]["rolling_1"]["50"] is None or numbers["measures"]["rolling_1"]["50"] >= 1
+    assert "mean, shape |" in information_tables.page(found, code)
+    assert information_tables.plot(found).count("</svg>") == 1
+    information_structure.write_gaussians(found.columns, tmp_path / "gaussians.parquet")
+    assert (tmp_path / "gaussians.parquet").stat().st_size > 1000
+    with pytest.raises(DuagError, match="has no robot zulu"):
+        information_structure.run(run, source, information_structure.StructurePlan(robots=("zulu",)))
