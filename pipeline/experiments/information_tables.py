@@ -150,11 +150,19 @@ def format_tables(found: Structure) -> str:
         ),
         "Windows: deviation along the normal over that from all keyframes, and Gaussians that the window knows.",
         _table(
-            ["K", "last K: known, %", "50 %", "90 %", "last K that saw it: 50 %", "90 %", "their r_k: 50 %"],
+            [
+                "keyframes K",
+                "last K: known, %",
+                "50 %",
+                "90 %",
+                "last K that saw it: 50 %",
+                "90 %",
+                "their r_k: 50 %",
+            ],
             [
                 [
                     str(K),
-                    _percent(np.isfinite(c[f"rolling_{K}"])),
+                    _percent(np.isfinite(c[f"rolling_{K}"][~np.isnan(c[f"rolling_{K}"])])),
                     *_cells(c[f"rolling_{K}"], (0.5, 0.9)),
                     *_cells(c[f"latest_{K}"], (0.5, 0.9)),
                     *_cells(c[f"r_latest_{K}"], (0.5,)),
@@ -246,7 +254,7 @@ def _cells(values: Array, shares: Sequence[float] = SHARES) -> list[str]:
 
 
 def _percent(which: NDArray[np.bool_]) -> str:
-    return f"{100 * np.mean(which):.1f}"
+    return f"{100 * np.mean(which):.1f}" if len(which) else "-"
 
 
 def _quantiles(values: Array) -> dict[str, float]:
