@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.row_blocks import row_blocks
-from duagc.pipeline.geometry import se3, so3, spd
+from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import (
@@ -235,12 +235,7 @@ def _rendered(gaussians: Gaussians, information: MapInformation | None) -> Array
 
 def _across_surface(gaussians: Gaussians, deviation_m: Array) -> Array:
     """Information [n, 3, 3], 1/m^2, of surfaces within the deviation [n] of means, along the discs' normals."""
-    rows = np.arange(len(gaussians))
-    axes = so3.from_quat_wxyz(gaussians.quats_wxyz.astype(np.float64))
-    normal = (
-        axes[rows, :, np.argmin(gaussians.log_scales, axis=1)]
-        / np.maximum(deviation_m, LEAST_DEVIATION_M)[:, None]
-    )
+    normal = gaussians.normals() / np.maximum(deviation_m, LEAST_DEVIATION_M)[:, None]
     return np.asarray(normal[:, :, None] * normal[:, None, :], dtype=np.float64)
 
 

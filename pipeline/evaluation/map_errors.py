@@ -6,17 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.evaluation import uncertainty_calibration
 from duagc.pipeline.evaluation.groundtruth import Surface
+from duagc.pipeline.evaluation.pixel_deviation import sigma_along
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.messages import GaussianMap
 from duagc.pipeline.runs.folder import position_information
 
-WORST_CONDITION = 1e12
 MIN_GAUSSIANS = 100
 NAMES = (
     "ece_paper", "ece_rank", "ece_rank_if_right", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95",
@@ -41,24 +40,6 @@ class MapErrors:
     without_information: int
 
 
-def position_sigma_m(gaussian_map: GaussianMap, normals: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Predicted standard deviation (m) of every Gaussian's center along unit directions [n, 3], and where it exists.
-
-    sigma^2 = n^T F^-1 n with F the position block of the Fisher information: everything else of the Gaussian and all
-    poses held fixed. It does not exist where F is singular (condition above 1e12).
-    """
-    sigma = np.full(len(gaussian_map.gaussians), np.inf)
-    determined = np.zeros(len(sigma), dtype=bool)
-    if gaussian_map.information is None:
-        return sigma, determined
-    F = position_information(gaussian_map.information.geometry)
-    values = np.linalg.eigvalsh(F)
-    determined = (values[:, 0] > 0) & (values[:, 2] < WORST_CONDITION * values[:, 0])
-    solved = np.linalg.solve(F[determined], normals[determined][..., None])[..., 0]
-    sigma[determined] = np.sqrt(np.sum(normals[determined] * solved, axis=1))
-    return sigma, determined
-
-
 def map_errors(gaussian_map: GaussianMap, surface: Surface, T_gt_map: Array) -> MapErrors:
     """Measure a map against the true surface.
 
@@ -68,15 +49,14 @@ def map_errors(gaussian_map: GaussianMap, surface: Surface, T_gt_map: Array) -> 
     """
     means_gt = se3.transform(T_gt_map, gaussian_map.gaussians.means.astype(np.float64))
     error_m, normals_gt = surface.closest(means_gt)
-    sigma_m, determined = position_sigma_m(gaussian_map, normals_gt @ T_gt_map[:3, :3])
-    trace = np.zeros(len(sigma_m))
+    F = np.zeros((len(means_gt), 3, 3))
     if gaussian_map.information is not None:
         F = position_information(gaussian_map.information.geometry)
-        trace = np.trace(F, axis1=1, axis2=2)
+    sigma_m, determined = sigma_along(F, normals_gt @ T_gt_map[:3, :3])
     return MapErrors(
         error_m[determined],
         sigma_m[determined],
-        1.0 / np.sqrt(trace[determined]),
+        1.0 / np.sqrt(np.trace(F[determined], axis1=1, axis2=2)),
         int(np.count_nonzero(~determined)),
     )
 

@@ -7,7 +7,7 @@ drawn in the colors of the camera that took the view.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -20,7 +20,6 @@ from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.evaluation import groundtruth, views
 from duagc.pipeline.evaluation.results import Absent, Row
-from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
@@ -236,9 +235,7 @@ class RenderTask:
     def chosen(self) -> list[int]:
         """Frames of the set, evenly spread, in order."""
         keyframes = {k.frame_index for k in self.camera_robot.keyframes}
-        frames_of_set = sorted(self.camera_robot.held_out if self.view_set == "held_out" else keyframes)
-        count = min(self.most, len(frames_of_set))
-        return [frames_of_set[k] for k in evenly_spaced(len(frames_of_set), count)]
+        return spread(self.camera_robot.held_out if self.view_set == "held_out" else keyframes, self.most)
 
     def scores(
         self, source: Recording, threads: int, title: str | None, *, skip: int = 0
@@ -248,17 +245,7 @@ class RenderTask:
         chosen = self.chosen()[skip:]
         with open_rgbd(source.log(name)) as log:
             log.move_depth_by(robot.folder / "frontend.mcap")
-            stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}
-            exact = groundtruth.exact_depths(source, name, stamps)
-            still = groundtruth.static_masks(source, name, stamps)
-            frames = _views(
-                log,
-                chosen,
-                exact,
-                still=still,
-                recorded_is_exact=groundtruth.recorded_depth_is_exact(source, name),
-                exposures=robot.exposures,
-            )
+            frames = scored_frames(log, chosen, source, robot)
             maps = {kind: (m.gaussians, poses_by_stamp(m.trajectory)) for kind, m in self.maps.items()}
             found = views.score_maps(
                 maps, log.camera, frames, threads=threads, depth=self.depth, compared=IN_EVERY_RUN
@@ -266,15 +253,27 @@ class RenderTask:
             yield from track(found, title, total=len(chosen)) if title else found
 
 
-def _views(
-    log: RgbdLog,
-    indices: list[int],
-    exact: Mapping[int, Any] | Absent,
-    *,
-    still: Mapping[int, NDArray[np.bool_]],
-    recorded_is_exact: bool,
-    exposures: ExposureTrack,
+def spread(frames: Collection[int], most: int) -> list[int]:
+    """At most so many of the frames, evenly spread, in order."""
+    in_order = sorted(frames)
+    return [in_order[k] for k in evenly_spaced(len(in_order), min(most, len(in_order)))]
+
+
+def scored_frames(
+    log: RgbdLog, indices: Sequence[int], source: Recording, robot: RobotRun
 ) -> Iterator[views.ScoredFrame]:
+    """Frames of a robot with their exact depth, where there is some.
+
+    Args:
+        log: of the robot.
+        indices: of the frames.
+        source: the recording.
+        robot: whose frames they are.
+    """
+    recorded_is_exact = groundtruth.recorded_depth_is_exact(source, robot.robot)
+    stamps = {f.stamp_ns for f in robot.frames if f.frame_index in indices}
+    exact = groundtruth.exact_depths(source, robot.robot, stamps)
+    still = groundtruth.static_masks(source, robot.robot, stamps)
     for index in indices:
         frame = log.frame(index)
         if (static := still.get(frame.stamp_ns)) is not None:
@@ -284,7 +283,7 @@ def _views(
             depth_m = frame.depth
         elif not isinstance(exact, Absent):
             depth_m = exact.get(frame.stamp_ns, Absent("the frame has no exact depth"))
-        yield views.ScoredFrame(frame, depth_m, exposures.at(index))
+        yield views.ScoredFrame(frame, depth_m, robot.exposures.at(index))
 
 
 def poses_by_stamp(trajectory: Trajectory) -> dict[int, NDArray[np.float64]]:

@@ -11,7 +11,13 @@ from duagc.pipeline.base import determinism, worker_reports
 from duagc.pipeline.base.checkpoints import Checkpoints, Shown
 from duagc.pipeline.base.worker_reports import Hear
 from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.evaluation import groundtruth, map_agreement, map_errors, uncertainty_calibration
+from duagc.pipeline.evaluation import (
+    groundtruth,
+    map_agreement,
+    map_errors,
+    pixel_errors,
+    uncertainty_calibration,
+)
 from duagc.pipeline.evaluation.rendering import Scored, poses_by_stamp, robot_scores
 from duagc.pipeline.evaluation.results import Absent, Row
 from duagc.pipeline.evaluation.true_paths import TruePaths
@@ -30,12 +36,14 @@ class RobotMeasures:
         agreement: of its images with each other at its poses.
         calibration: scores of its fused map next to the true surface; a reason where there is none.
         reliability: of these, rows of the long table.
+        pixels: calibration of the depth that its maps render, by map and set of views.
     """
 
     scores: list[Scored]
     agreement: dict[str, Any]
     calibration: dict[str, Any]
     reliability: list[Row]
+    pixels: pixel_errors.Scores
 
 
 @dataclass(frozen=True)
@@ -109,10 +117,14 @@ class RobotTask:
         )
         hear((name, "surface", 0, 1))
         calibration, rows = save.done("calibration", lambda: _calibration_of(robot, source, truth))
+        hear((name, "pixels", 0, 1))
+        pixels = save.done(
+            "pixels", lambda: pixel_errors.scores_of_robot(run, source, name, threads=self.threads)
+        )
         hear((name, "agreement", 0, 1))
         agreement = save.done("agreement", lambda: _agreement_section(robot, source, truth))
         hear((name, "agreement", 1, 1))
-        return RobotMeasures(scores, agreement, calibration, rows)
+        return RobotMeasures(scores, agreement, calibration, rows, pixels)
 
 
 def measured(

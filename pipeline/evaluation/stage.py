@@ -17,6 +17,7 @@ from duagc.pipeline.evaluation import (
     coverage,
     groundtruth,
     map_errors,
+    pixel_errors,
     trajectory_errors,
 )
 from duagc.pipeline.evaluation.network import Session
@@ -73,6 +74,8 @@ PROTOCOL = {
     "own_longer": "if asked for, the own map trained again as the refined one was, alone; seen as the own map",
     "refined": "the final map: the fused one trained again on own images and peers' maps, seen as the fused map",
     "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
+    "pixel_calibration": "rendered against exact depth, else against recorded depth, whose own noise then counts in "
+    f"sigma; every {pixel_errors.EVERY_PX}th pixel of at most {pixel_errors.MOST_VIEWS} views; mean of robots",
 }
 
 
@@ -142,6 +145,7 @@ def evaluate(
         "components": coverage.of_components(run, truth.after),
         "rendering": rendering.team,
         "calibration": _calibration_section(source, of_robots, rows),
+        "pixel_calibration": _pixel_section(of_robots, rows),
         "exchange": session.exchange_section(),
         "consensus": session.consensus_section() | _matching_section(run, source, truth, session),
         "protocol": PROTOCOL | {"views": f"at most {most_views} of a set, evenly spread"},
@@ -233,6 +237,16 @@ def _calibration_section(
     }
 
 
+def _pixel_section(robots: Mapping[str, RobotMeasures], rows: list[Row]) -> dict[str, Any]:
+    """Mean over robots of the calibration of rendered depth; the values of each robot go into rows."""
+    for name, robot in robots.items():
+        rows += [
+            Row("pixel_calibration", name, "/".join(path[:-1]), -1, path[-1], value)
+            for path, value in leaves(robot.pixels)
+        ]
+    return pixel_errors.team_scores([robot.pixels for robot in robots.values()])
+
+
 def _mean_or_sum(name: str, values: list[float | Absent]) -> float | Absent:
     """Counts add up over robots, scores average."""
     if name.startswith("gaussians"):
@@ -263,7 +277,8 @@ def _rows_of(tree: Mapping[str, Any]) -> list[Row]:
             continue
         scope, name = path[0].removesuffix("s") if path[0] == "robots" else path[0], path[-1]
         robot = path[1] if path[0] in ("robots", "coverage", "components") else ""
-        view_set = "/".join(path[path.index("rendering") + 1 : -1]) if "rendering" in path else ""
+        of_maps = next((k for k, part in enumerate(path) if part in ("rendering", "pixel_calibration")), None)
+        view_set = "" if of_maps is None else "/".join(path[of_maps + 1 : -1])
         rows.append(
             Row(scope, robot, view_set, -1, name, value if isinstance(value, Absent) else float(value))
         )

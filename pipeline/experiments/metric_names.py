@@ -35,6 +35,11 @@ _CALIBRATION = (
     "coverage_95_scaled sigma_scale gaussians gaussians_without_information"
 )
 
+_PIXELS = (
+    "pixels median_error_m median_sigma_m spearman ece_rank ece_rank_if_right ece_rank_shuffled coverage_95 nll "
+    "sigma_scale coverage_95_scaled nll_scaled"
+)
+
 
 def _known() -> Iterator[str]:
     for section, keys in (
@@ -52,6 +57,9 @@ def _known() -> Iterator[str]:
     ]
     for views in (*of_maps, "own.training", "fused.training", "own_unrefined.held_out"):
         yield from (f"rendering.{views}.{key}" for key in _VIEWS.split())
+    for map_ in ("own", "refined"):
+        for views in ("held_out", "peers"):
+            yield from (f"pixel_calibration.{map_}.{views}.{key}" for key in _PIXELS.split())
 
 
 KNOWN = tuple(_known())

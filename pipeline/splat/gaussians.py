@@ -101,6 +101,11 @@ class Gaussians:
         quats = so3.multiply_quat_wxyz(so3.to_quat_wxyz(T[..., :3, :3]), self.quats_wxyz)
         return self.replace(means=means.astype(np.float32), quats_wxyz=quats.astype(np.float32))
 
+    def normals(self) -> NDArray[np.float64]:
+        """Unit normals [n, 3] of the discs: the axes of the smallest scales; their signs say nothing."""
+        axes = so3.from_quat_wxyz(self.quats_wxyz.astype(np.float64))
+        return np.asarray(axes[np.arange(len(self)), :, np.argmin(self.log_scales, axis=1)])
+
     def moved(self, T_old_keyframe: ArrayLike, T_new_keyframe: ArrayLike) -> Gaussians:
         """Move every Gaussian with its anchor.
 

@@ -47,6 +47,12 @@ SCHEMA = {
          "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information"),
         NUMBER,
     ),
+    "pixel_calibration": {
+        kind: {view_set: {"pixels": int} | dict.fromkeys(
+            ("median_error_m", "median_sigma_m", "spearman", "ece_rank", "ece_rank_if_right", "ece_rank_shuffled",
+             "coverage_95", "nll", "sigma_scale", "coverage_95_scaled", "nll_scaled"), NUMBER,
+        ) for view_set in ("held_out", "peers")} for kind in ("own", "refined")
+    },
     "coverage": {"*": {
         "frames": int, "frames_without_pixel": int, "posed": int, "coverage": NUMBER, "submaps": int, "components": int,
     }},
@@ -66,7 +72,7 @@ SCHEMA = {
         ("alignment", "ate", "team_ate", "rpe", "depth_agreement", "feature_agreement",
          "initial_relative_poses", "held_out", "peers", "training", "poses",
          "exposure", "colors", "own_unrefined", "own_longer", "refined", "team", "common", "background", "psnr", "ssim",
-         "ms_ssim", "depth", "calibration", "oracle", "views"),
+         "ms_ssim", "depth", "calibration", "pixel_calibration", "oracle", "views"),
         str,
     ),
 }  # fmt: skip
@@ -92,6 +98,6 @@ def check_against_schema(metrics: dict) -> None:
     walk({k: v for k, v in metrics.items() if k != "reasons"}, SCHEMA, ())
     assert all(len(reason_of(metrics["reasons"], name)) > 8 for name in nulls)
     patterns = [pattern for patterns in metrics["reasons"].values() for pattern in patterns]
-    assert len(patterns) < 40 < len(nulls)  # absent values once per reason, not once per name
+    assert len(patterns) < 45 < len(nulls)  # absent values once per reason, not once per name
     for pattern in patterns:
         assert any(fnmatchcase(name, pattern) for name in nulls), pattern

@@ -10,13 +10,13 @@ from duagc import schemas
 from duagc.converters.simulate.ply import write_points
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.evaluation import map_errors, rendering, views
+from duagc.pipeline.evaluation import rendering, views
 from duagc.pipeline.evaluation.groundtruth import Surface, surface
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import top_view_axes
+from duagc.pipeline.evaluation.pixel_deviation import sigma_along
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.kernels import Render
 from duagc.pipeline.recording import LogWriter, Recording, open_rgbd
 from duagc.pipeline.runs.digest import digest_file
@@ -74,21 +74,16 @@ def test_the_depth_of_one_layer_is_a_figure_of_its_own():
     assert views.score_view(a_render(), color, recorded, Absent("none")).depth_l1_layer_m == views.NO_LAYER
 
 
-def test_what_moves_by_the_truth_counts_in_no_view(tmp_path):
-    recording = Recording(make(tmp_path).recording)
+def test_what_moves_by_the_truth_counts_in_no_view(tmp_path, monkeypatch):
+    made = make(tmp_path)
+    recording, robot = Recording(made.recording), RunFolder(made.run).robots["alpha"]
     with open_rgbd(recording.log("alpha")) as log:
-        stamps, shape = [log.frame(k).stamp_ns for k in (0, 1)], log.frame(0).depth.shape
+        shape = log.frame(0).depth.shape
         left = np.zeros(shape, bool)
         left[:, : shape[1] // 2] = True
-        made = rendering._views(
-            log,
-            [0, 1],
-            Absent("none"),
-            still={stamps[1]: left},
-            recorded_is_exact=False,
-            exposures=ExposureTrack(),
-        )
-        seen = [view.frame.mask for view in made]
+        static = {robot.frames[1].stamp_ns: left}
+        monkeypatch.setattr(rendering.groundtruth, "static_masks", lambda *of: static)
+        seen = [view.frame.mask for view in rendering.scored_frames(log, [0, 1], recording, robot)]
     assert seen[0] is None
     assert np.array_equal(seen[1], left)
 
@@ -172,8 +167,9 @@ def test_sigma_is_that_along_the_normal(tmp_path):
     fused = RunFolder(make(tmp_path).run).robots["alpha"].fused_map
     along_z = np.tile([0.0, 0.0, 1.0], (len(fused.gaussians), 1))
     along_x = np.tile([1.0, 0.0, 0.0], (len(fused.gaussians), 1))
-    sigma_z, determined = map_errors.position_sigma_m(fused, along_z)
-    sigma_x, _ = map_errors.position_sigma_m(fused, along_x)
+    F = position_information(fused.information.geometry)
+    sigma_z, determined = sigma_along(F, along_z)
+    sigma_x, _ = sigma_along(F, along_x)
     assert determined.all()
     assert sigma_x == pytest.approx(10.0 * sigma_z, rel=1e-5)  # float32 information
 

@@ -119,7 +119,7 @@ def test_an_evaluation_that_was_killed_goes_on_with_what_is_done(metrics, tmp_pa
             evaluate(fake.run, fake.recording, progress=False, saved=saved)
     done = sorted(path.relative_to(saved).as_posix() for path in saved.rglob("*.done"))
     assert [name.split()[0] for name in done] == [
-        "alpha/calibration.done", "alpha/held_out", "alpha/peers", "alpha/training",
+        "alpha/calibration.done", "alpha/held_out", "alpha/peers", "alpha/pixels.done", "alpha/training",
     ]  # fmt: skip
     drawn = []
     score_maps = scored_views.score_maps
@@ -197,6 +197,18 @@ def test_calibration_finds_that_the_information_is_right(metrics):
     assert calibration["spearman"] > 0.5
     assert calibration["ece_rank"] < 0.15 < 0.22 < calibration["ece_rank_shuffled"]
     assert calibration["ece_rank"] == pytest.approx(calibration["ece_rank_if_right"], abs=0.01)
+
+
+def test_pixels_are_judged_against_exact_depth_alone(metrics):
+    found = metrics["pixel_calibration"]["refined"]
+    for view_set in ("held_out", "peers"):
+        # the images are renders of the map: nothing is left but their rounding to a millimeter
+        assert found[view_set]["median_error_m"] < 5e-4
+        assert (
+            1e-3 < found[view_set]["median_sigma_m"] < 1e-2
+        )  # as the information says; no noise of a sensor
+        assert found[view_set]["coverage_95"] > 0.99
+    assert found["held_out"]["pixels"] == 2 * 3 * 48  # robots, views, pixels of 64 x 48
 
 
 def test_the_exchange_is_counted(metrics):

@@ -8,6 +8,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.batch.suite import SuiteFile
+from duagc.pipeline.evaluation.pixel_errors import MAPS, NAMES, SETS
 from duagc.pipeline.experiments.carry_out import check_recordings, prepare
 from duagc.pipeline.experiments.metric_names import KNOWN, names_in, needs_truth
 from duagc.pipeline.experiments.predicted import predicted_time
@@ -119,7 +120,9 @@ def test_the_known_metrics_are_those_of_a_run() -> None:
     """Of the golden demo, which has all of them but those of truth that no simulation lacks."""
     golden = json.loads((ROOT / "tests" / "golden" / "demo.json").read_text(encoding="utf-8"))["metrics"]
     numbers = {name: value for name, value in golden.items() if isinstance(value, int | float)}
-    absent = {name for name in KNOWN if not names_in(name, golden)}
+    pixels = {f"pixel_calibration.{m}.{s}.{key}" for m in MAPS for s in SETS for key in NAMES}
+    assert pixels == {name for name in KNOWN if name.startswith("pixel_calibration.")}
+    absent = {name for name in KNOWN if not names_in(name, golden)} - pixels
     on_request = {name for name in KNOWN if name.startswith(("rendering.central.", "consensus.matching_"))}
     assert absent == on_request != set()
     for section in ("team.", "exchange.", "calibration."):

@@ -1,0 +1,161 @@
+"""The depth that a map renders at a pixel, and its standard deviation by the stated ones of the Gaussians it blends.
+
+docs/explanation/information.md, "The deviation of a rendered pixel", derives the formula.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
+from duagc.pipeline.evaluation.rendering import in_world
+from duagc.pipeline.evaluation.views import surface_depth
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.messages import GaussianMap
+from duagc.pipeline.runs.folder import RobotRun, position_information
+from duagc.pipeline.splat.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from duagc.pipeline.geometry.camera import PinholeCamera
+    from duagc.pipeline.geometry.masks import Mask
+    from duagc.pipeline.kernels import Rasterizer
+
+WORST_CONDITION = 1e12
+"""Of the information of a position; a direction of one that is worse is not determined in float64."""
+LEAST_ACROSS = 0.1
+"""Of a ray of depth one, along a normal: a disc seen more from the side, by 84 degrees, is no surface for the ray."""
+NEAREST_M = 0.05
+"""Depth of a center up to which its ray says nothing; as near as the rasterizer draws is farther."""
+
+
+@dataclass(frozen=True)
+class StatedMap:
+    """A map with what is stated of its Gaussians.
+
+    Attributes:
+        gaussians: n.
+        sigma_m: standard deviation of every mean along the normal of its disc, meters [n].
+        depth: of a Gaussian at a pixel, as the map was made.
+    """
+
+    gaussians: Gaussians
+    sigma_m: Array
+    depth: DepthKind
+
+    def __post_init__(self) -> None:
+        if self.sigma_m.shape != (len(self.gaussians),):
+            raise ValueError(f"sigma_m has shape {self.sigma_m.shape}, expected ({len(self.gaussians)},)")
+
+
+@dataclass(frozen=True)
+class RenderedDepth:
+    """Images [h, w] in meters: depth, 0 where alpha is below 0.5, and its standard deviation, 0 likewise."""
+
+    depth_m: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+
+
+def sigma_along(information: Array, directions: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Standard deviation (m) [n] of positions along unit directions, and where it is determined; else infinite.
+
+    sigma^2 = n^T F^-1 n: everything but the position and all poses held fixed.
+
+    Args:
+        information: of the positions, 1/m^2 [n, 3, 3]; singular (condition above 1e12) is not determined.
+        directions: [n, 3], in the same frame.
+    """
+    sigma = np.full(len(information), np.inf)
+    values = np.linalg.eigvalsh(information) if len(information) else np.zeros((0, 3))
+    determined = (values[:, 0] > 0) & (values[:, 2] < WORST_CONDITION * values[:, 0])
+    some = directions[determined]
+    solved = np.linalg.solve(information[determined], some[..., None])[..., 0]
+    sigma[determined] = np.sqrt(np.sum(some * solved, axis=1))
+    return sigma, determined
+
+
+def stated_own(robot: RobotRun, unknown_m: float) -> StatedMap:
+    """A robot's own map in its map frame, with what it tells its peers of it.
+
+    Args:
+        robot: of a run.
+        unknown_m: standard deviation of a Gaussian of which nothing is stated.
+    """
+    own, T_map_keyframe = robot.own_map, np.array([k.T_map_camera for k in robot.keyframes])
+    evidence = Evidence.from_map(robot.robot, own.gaussians, robot.information, T_map_keyframe)
+    return _stated(own, evidence.in_world(T_map_keyframe).position_information(), unknown_m)
+
+
+def stated_in_world(robot: RobotRun, shown: GaussianMap, unknown_m: float) -> StatedMap:
+    """The fused or the final map of a robot; training after fusion does not change what is stated of a Gaussian.
+
+    Args:
+        robot: of a run.
+        shown: one of these maps of it.
+        unknown_m: standard deviation of a Gaussian of which nothing is stated.
+    """
+    information = robot.fused_map.information
+    F = np.zeros((len(shown.gaussians), 3, 3))
+    if information is not None:
+        rows = rows_by_id(shown.gaussians.ids, information.ids)
+        F[rows >= 0] = position_information(information.geometry[rows[rows >= 0]])
+    return _stated(shown, F, unknown_m)
+
+
+def own_in_world(robot: RobotRun, own: StatedMap) -> StatedMap:
+    """The own map where consensus puts its keyframes: what is stated along a normal moves with it."""
+    return StatedMap(in_world(robot, "own", own.gaussians), own.sigma_m, own.depth)
+
+
+def _stated(shown: GaussianMap, information: Array, unknown_m: float) -> StatedMap:
+    sigma_m, known = sigma_along(information, shown.gaussians.normals())
+    return StatedMap(shown.gaussians, np.where(known, sigma_m, unknown_m), shown.depth)
+
+
+def rendered_depth(
+    rasterizer: Rasterizer,
+    stated: StatedMap,
+    camera: PinholeCamera,
+    T_camera_map: ArrayLike,
+    *,
+    mask: Mask | None = None,
+) -> RenderedDepth:
+    """The depth of a map and its standard deviation at every pixel, from one render.
+
+    Moved by its deviation along its normal n, a Gaussian moves by sigma / |n r| along the ray r of depth one. However
+    the errors of Gaussians go together, their mean by blending weight deviates by no more than the mean of their
+    deviations, which is drawn as a color. Where the pixel blends surfaces, the blended depth is that of neither: the
+    difference from the depth of the layer that stops half of the light counts in quadrature.
+
+    Args:
+        rasterizer: draws.
+        stated: the map.
+        camera: of the view.
+        T_camera_map: [4, 4].
+        mask: bool [h, w], pixels that are drawn; the others are 0. None: all.
+    """
+    T = np.asarray(T_camera_map, dtype=np.float64)
+    along_ray_m = _along_rays(stated, T).astype(np.float32)
+    colors = np.repeat(along_ray_m[:, None], 3, axis=1)
+    gaussians = stated.gaussians.replace(colors=colors)
+    render = rasterizer.forward(gaussians, camera, T, depth_kind=stated.depth, mask=mask)
+    layer_m, depth_m = rasterizer.layer_depth(), surface_depth(render)
+    sigma_m = np.zeros_like(depth_m)
+    drawn = depth_m > 0
+    blended_m = render.color[..., 0][drawn] / render.alpha[drawn]
+    between_m = np.where(layer_m[drawn] > 0, depth_m[drawn] - layer_m[drawn], 0.0)
+    sigma_m[drawn] = np.hypot(blended_m, between_m)
+    return RenderedDepth(depth_m, sigma_m)
+
+
+def _along_rays(stated: StatedMap, T_camera_map: Array) -> Array:
+    """Standard deviation of the depth [n], meters, where the ray through the center meets every disc."""
+    centers = se3.transform(T_camera_map, stated.gaussians.means.astype(np.float64))
+    normals = stated.gaussians.normals() @ T_camera_map[:3, :3].T
+    across = np.abs(np.sum(normals * centers, axis=1)) / np.maximum(centers[:, 2], NEAREST_M)
+    return np.asarray(stated.sigma_m / np.maximum(across, LEAST_ACROSS))
