@@ -163,6 +163,17 @@ CALIBRATION = {
     "gaussians_without_information": ("Left out", "Gaussians with a direction that nothing determines"),
 }  # fmt: skip
 
+PIXEL_CALIBRATION = {
+    "pixels": ("Pixels", "judged, all robots"),
+    "median_error_m": ("Error", "median absolute difference of rendered and true depth"),
+    "median_sigma_m": ("σ", "median predicted standard deviation of it"),
+    "coverage_95": ("Coverage of 95 %", "share of errors within 1.96 predicted σ"),
+    "sigma_scale": ("Fitted scale", "the likeliest factor on σ; above 1 if over-confident"),
+    "spearman": ("Spearman", "rank correlation of predicted and observed error"),
+    "ece_rank": ("ECE, ranks", "gap between predicted and observed rank per decile; 0 is perfect"),
+    "ece_rank_if_right": ("if right", "the same of errors drawn from the predictions"),
+    "ece_rank_shuffled": ("shuffled", "the same with the predictions dealt out at random"),
+}
 
 LOOP_CLOSURE = {
     "robot": ("Robot", "the robot that decided"),
@@ -227,6 +238,22 @@ def rows(
         }
         for name, (label, meaning) in words.items()
         if name in section
+    ]
+
+
+def pixel_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Calibration of rendered depth: a row of "name" and "cells" for each map and set of views that has numbers."""
+    return [
+        {
+            "name": f"{MAPS[kind]}, {VIEW_SETS[view_set]}",
+            "cells": [
+                {"label": label, "meaning": meaning, "value": text(key, found[key])}
+                for key, (label, meaning) in PIXEL_CALIBRATION.items()
+            ],
+        }
+        for kind, sets in metrics.get("pixel_calibration", {}).items()  # runs of earlier versions have none
+        for view_set, found in sets.items()
+        if found["pixels"] is not None
     ]
 
 

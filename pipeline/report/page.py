@@ -73,7 +73,7 @@ def content(run: RunFolder, source: Recording, workers: int) -> dict[str, Any]:
     metrics = run.metrics
     reasons = metrics["reasons"]
     session = Session(run)
-    shown_views, information_views = rendered_views(run, source, workers)
+    shown_views, deviation_views = rendered_views(run, source, workers)
     return {
         "title": f"{source.name}: {_count(len(run.robots), 'robot')}",
         "subtitle": _subtitle(metrics),
@@ -93,10 +93,10 @@ def content(run: RunFolder, source: Recording, workers: int) -> dict[str, Any]:
         **_agreement_content(session, metrics, reasons),
         "exchange_charts": _exchange_charts(session),
         "exchange": labels.rows(metrics["exchange"], labels.EXCHANGE, reasons, "exchange"),
-        "uncertainty_lead": _uncertainty_lead(run),
-        "information_views": information_views,
+        "deviation_views": deviation_views,
         "reliability_chart": _reliability_chart(run),
         "calibration": labels.rows(metrics["calibration"], labels.CALIBRATION, reasons, "calibration"),
+        "pixel_calibration": labels.pixel_rows(metrics),
         **_timing_content(run),
         "absent": _absent(reasons),
         "protocol": list(metrics["protocol"].items()),
@@ -296,17 +296,6 @@ def _exchange_charts(session: Session) -> list[dict[str, str]]:
 
 
 # --- uncertainty -------------------------------------------------------------------------------------------------
-
-
-def _uncertainty_lead(run: RunFolder) -> str:
-    kinds = {r.fused_map.information.kind for r in run.robots.values() if r.fused_map.information is not None}
-    if not kinds:
-        return "The fused maps carry no information about their Gaussians."
-    return (
-        "Fused maps colored by the predicted standard deviation of each Gaussian's center "
-        f"({', '.join(sorted(kinds))} Fisher information, poses held "
-        "fixed); gray where some direction is not determined by any view."
-    )
 
 
 def _reliability_chart(run: RunFolder) -> str:

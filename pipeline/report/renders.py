@@ -1,4 +1,4 @@
-"""The pictures of a report: maps rendered next to the images of some views, and colored by their uncertainty."""
+"""The pictures of a report: maps rendered next to the images of some views; predicted and found errors of depth."""
 
 from __future__ import annotations
 
@@ -13,17 +13,22 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.evaluation.groundtruth import recorded_depth_is_exact
+from duagc.pipeline.evaluation.pixel_deviation import StatedMap, rendered_depth, stated_in_world
+from duagc.pipeline.evaluation.pixel_errors import stated_noise, true_depth
 from duagc.pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.evaluation.views import in_exposure, score_view, surface_depth
+from duagc.pipeline.evaluation.views import ScoredFrame, in_exposure, score_view, surface_depth
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.geometry.masks import checkered
 from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import GaussianMap
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import figures, labels, pictures
-from duagc.pipeline.runs.folder import RobotRun, RunFolder, position_information
+from duagc.pipeline.runs.folder import RobotRun, RunFolder
 from duagc.pipeline.runs.peer_colors import read_peer_colors
 from duagc.pipeline.runs.stages import REPORT
 
@@ -36,15 +41,13 @@ VIEWS_PER_ROBOT = 2
 COLOR_ERROR_END = 0.3
 DEPTH_ERROR_END_M = 0.05
 NO_EXACT = Absent("not needed for a picture")
-UNDETERMINED_GRAY = 0.75
 
 
 Views = list[dict[str, Any]]
 
 
 def rendered_views(run: RunFolder, source: Recording, workers: int = 1) -> tuple[Views, Views]:
-    """Renders next to images, and the fused map colored by its uncertainty, for a few held-out views per robot, and
-    next to the image of a peer.
+    """Renders next to images for a few held-out views per robot and one of a peer, and predicted deviations of depth.
 
     Args:
         run: the run.
@@ -61,7 +64,9 @@ def rendered_views(run: RunFolder, source: Recording, workers: int = 1) -> tuple
                 for number, name in numbered
             ]
             drawn = [result.result() for result in begun]
-    return [view for shown, _ in drawn for view in shown], [view for _, colored in drawn for view in colored]
+    return [view for shown, _ in drawn for view in shown], [
+        view for _, predicted in drawn for view in predicted
+    ]
 
 
 def _views_in_worker(run: Path, recording: Path, name: str, number: int) -> tuple[Views, Views]:
@@ -75,20 +80,36 @@ def _views_of(run: RunFolder, source: Recording, name: str, number: int) -> tupl
     from duagc.pipeline.kernels import Rasterizer
 
     rasterizer = Rasterizer(threads=1)
-    shown, colored, robot = Views(), Views(), run.robots[name]
+    shown, deviations, robot = Views(), Views(), run.robots[name]
     head = {"robot": name, "color": figures.color_of(number), "where": ""}
     with open_rgbd(source.log(name)) as log:
         log.move_depth_by(robot.folder / "frontend.mcap")
         frames = [log.frame(index) for index in _chosen_frames(robot, len(log))]
         shown += [head | view for view in _own_views(robot, log, frames, rasterizer)]
-        if robot.fused_map.information is not None and frames:
-            colored.append(head | _information_view(robot, log, frames, rasterizer))
+        if frames:
+            kind, final = _final(robot)
+            settings = run.config.information
+            predicted = _deviation_view(
+                stated_in_world(robot, final, settings.deviation_gate_m),
+                robot.trajectory,
+                log,
+                [_compared(frame, source, name) for frame in frames],
+                kind=kind,
+                noise=stated_noise(settings),
+                rasterizer=rasterizer,
+            )
+            deviations.append(head | predicted)
     for peer in mates(run, robot)[:1]:
         with open_rgbd(source.log(peer.robot)) as log:
             log.move_depth_by(peer.folder / "frontend.mcap")
             views = _peer_views(robot, peer, log, rasterizer)
             shown += [head | {"where": f" of {peer.robot}"} | view for view in views]
-    return shown, colored
+    return shown, deviations
+
+
+def _compared(frame: RgbdFrame, source: Recording, robot: str) -> ScoredFrame:
+    """A frame whose recorded depth the renders are compared with, and whether that has noise."""
+    return ScoredFrame(frame, frame.depth if recorded_depth_is_exact(source, robot) else NO_EXACT)
 
 
 def _own_views(
@@ -215,51 +236,39 @@ def _range_m(depths_m: NDArray[np.float32]) -> tuple[float, float]:
     return float(low), float(max(high, low + 1e-3))
 
 
-def _information_view(
-    robot: RobotRun, log: RgbdLog, frames: Iterable[RgbdFrame], rasterizer: Rasterizer
+def _deviation_view(
+    stated: StatedMap,
+    path: Trajectory,
+    log: RgbdLog,
+    frames: Iterable[ScoredFrame],
+    *,
+    kind: str,
+    noise: DepthNoise,
+    rasterizer: Rasterizer,
 ) -> dict[str, Any]:
-    information = robot.fused_map.information
-    assert information is not None
-    colors, low_m, high_m = sigma_colors(position_sigma_m(information.geometry))
-    gaussians = robot.fused_map.gaussians.replace(colors=colors)
-    poses = poses_by_stamp(robot.trajectory)
-    shown = []
-    for frame in frames:
-        render = rasterizer.forward(
-            gaussians, log.camera, se3.inverse(poses[frame.stamp_ns]), background=(1.0, 1.0, 1.0)
-        )
-        shown.append(
-            {"caption": f"image, frame {frame.index}", "uri": _uri(checkered(frame.color, frame.mask))}
-        )
-        shown.append({"caption": "uncertainty", "uri": _uri(pictures.to_uint8(render.color))})
+    """Predicted and found differences of rendered and recorded depth at frames, on one scale."""
+    poses, shown, ends = poses_by_stamp(path), [], [0.0]
+    for view in frames:
+        frame = view.frame
+        recorded_m, sensor_m = true_depth(view, noise)
+        rendered = rendered_depth(rasterizer, stated, log.camera, se3.inverse(poses[frame.stamp_ns]))
+        both = (recorded_m > 0) & (rendered.depth_m > 0)
+        predicted_m = np.hypot(rendered.sigma_m, sensor_m)
+        ends.append(float(np.percentile(predicted_m[both], 95)) if both.any() else 0.0)
+        shown.append((frame, both, predicted_m, np.abs(rendered.depth_m - recorded_m)))
+    end_m, columns = max(ends), list[tuple[str, NDArray[np.uint8]]]()
+    for frame, both, *values_m in shown:
+        predicted, found = (pictures.colored(v, 0.0, end_m, valid=both, palette="magma") for v in values_m)
+        columns.append((f"image, frame {frame.index}", checkered(frame.color, frame.mask)))
+        columns.append((f"predicted deviation, {kind} map", predicted))
+        columns.append((f"absolute error, {kind} map", found))
     scale = _scale(
-        "plasma",
-        labels.meters_text(low_m),
-        labels.meters_text(high_m),
-        "standard deviation of a center, log scale",
+        "magma", "0", f"{labels.meters_text(end_m)} and more", "predicted deviation and absolute error"
     )
-    return {"pictures": shown, "scales": [scale]}
-
-
-def position_sigma_m(geometry: NDArray[np.float32]) -> Array:
-    """Standard deviation of every center, meters [n]: sqrt trace F^-1; infinite where a direction is not determined."""
-    F = position_information(geometry)
-    values = np.linalg.eigvalsh(F) if len(F) else np.zeros((0, 3))
-    determined = (values[:, 0] > 0) & (values[:, 2] < 1e12 * values[:, 0])
-    sigma = np.full(len(F), np.inf)
-    sigma[determined] = np.sqrt(np.sum(1.0 / values[determined], axis=1))
-    return sigma
-
-
-def sigma_colors(sigma_m: Array) -> tuple[NDArray[np.float32], float, float]:
-    """Colors [n, 3] on a logarithmic scale over the middle 90 %, gray where infinite, and the ends of the scale."""
-    known = np.isfinite(sigma_m)
-    colors = np.full((len(sigma_m), 3), UNDETERMINED_GRAY, dtype=np.float32)
-    if not known.any():
-        return colors, 1.0, 1.0
-    low, high = np.percentile(np.log10(sigma_m[known]), [5, 95])
-    colors[known] = pictures.color_by(np.log10(sigma_m[known]), low, high, "plasma")
-    return colors, float(10.0**low), float(10.0**high)
+    return {
+        "pictures": [{"caption": caption, "uri": _uri(picture)} for caption, picture in columns],
+        "scales": [scale],
+    }
 
 
 def _uri(picture: NDArray[np.uint8]) -> str:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.files import new_file
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import Path3, paths
+from duagc.pipeline.evaluation.pixel_deviation import sigma_along
 from duagc.pipeline.evaluation.rendering import poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import so3
@@ -19,8 +21,8 @@ from duagc.pipeline.geometry.masks import checkered
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import labels
 from duagc.pipeline.report.figures import color_of
-from duagc.pipeline.report.renders import position_sigma_m, sigma_colors
-from duagc.pipeline.runs.folder import RobotRun, RunFolder
+from duagc.pipeline.report.pictures import color_by
+from duagc.pipeline.runs.folder import RobotRun, RunFolder, position_information
 from duagc.pipeline.splat.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 APPLICATION = "duagc"
 TIME = "time"  # timeline of a run: time of the recording, then of the session
 ROUND = "round"  # timeline of a run: rounds of the session
+UNDETERMINED_GRAY = 0.75
 LARGEST_LOG_SCALE = float(np.log(1e3))  # a kilometer: beyond it numbers overflow and the picture is the same
 
 
@@ -128,8 +131,23 @@ def _log_map(stream: rr.RecordingStream, entity: str, robot: RobotRun, max_gauss
     shown = fused.gaussians.select(chosen)
     stream.log(f"{entity}/fused", splats(shown, shown.colors), static=True)
     if fused.information is not None:
-        colors, _, _ = sigma_colors(position_sigma_m(fused.information.geometry))
+        F = position_information(fused.information.geometry)
+        colors = sigma_colors(sigma_along(F, fused.gaussians.normals())[0])
         stream.log(f"{entity}/uncertainty", splats(shown, colors[chosen]), static=True)
+
+
+def sigma_colors(sigma_m: Array) -> NDArray[np.float32]:
+    """Colors [n, 3] on a logarithmic scale over the middle 90 % of the values, gray where infinite.
+
+    Args:
+        sigma_m: standard deviations [n].
+    """
+    known = np.isfinite(sigma_m)
+    colors = np.full((len(sigma_m), 3), UNDETERMINED_GRAY, dtype=np.float32)
+    if known.any():
+        low, high = np.percentile(np.log10(sigma_m[known]), [5, 95])
+        colors[known] = color_by(np.log10(sigma_m[known]), low, high, "plasma")
+    return colors
 
 
 def splats(gaussians: Gaussians, colors: NDArray[np.float32]) -> Any:
@@ -283,7 +301,7 @@ def _blueprint(run: RunFolder) -> rrb.Blueprint:
                             name=name,
                             eye_controls=eye,
                         )
-                        for coloring, name in (("fused", "Fused map"), ("uncertainty", "Uncertainty"))
+                        for coloring, name in (("fused", "Fused map"), ("uncertainty", "σ along the normal"))
                     )
                 ),
                 rrb.Vertical(*images),

@@ -9,7 +9,6 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.report import figures, labels, pictures, write_report
 from duagc.pipeline.report.cards import cards
-from duagc.pipeline.report.renders import sigma_colors
 from tests.fixtures.fake_run import make
 
 
@@ -63,6 +62,8 @@ def test_the_page_shows_numbers_with_units_pictures_and_reasons(html):
         "3.5 s",
         "210 MB",
         "few_matches",
+        "predicted deviation, refined map",
+        "refined (final), own held-out views",
     ):
         assert expected in text, expected
     assert html.count("data:image/jpeg") > 4 * 9  # nine pictures of each of four views, and more
@@ -155,13 +156,6 @@ def test_colors_of_a_scalar_image():
     assert tuple(rgb[0, 3]) == pictures.NOTHING
     assert rgb[0, 0].tolist() == [68, 1, 84]  # the ends of viridis
     assert rgb[0, 2].tolist() == [253, 231, 37]
-
-
-def test_undetermined_gaussians_are_gray():
-    colors, low, high = sigma_colors(np.array([0.001, 0.01, np.inf]))
-    assert colors[2].tolist() == [0.75] * 3
-    assert 0.001 < low < high < 0.01
-    assert sigma_colors(np.array([np.inf]))[0].tolist() == [[0.75] * 3]
 
 
 def test_the_charts_name_what_they_show(html):

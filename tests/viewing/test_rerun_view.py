@@ -82,6 +82,14 @@ def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
     assert not (tmp_path / "run.rrd.part").exists()
 
 
+def test_gaussians_are_colored_by_the_decade_of_sigma_and_gray_where_it_is_not_determined():
+    colors = run_rrd.sigma_colors(np.array([0.001, 0.01, 0.1, np.inf]))
+    assert colors[3].tolist() == [0.75] * 3
+    middle = run_rrd.sigma_colors(np.array([1.0, 10.0, 100.0]))[1]
+    assert np.array_equal(colors[1], middle)
+    assert run_rrd.sigma_colors(np.array([np.inf])).tolist() == [[0.75] * 3]
+
+
 def test_robots_that_never_met_share_no_world(tmp_path):
     fake = make(tmp_path, joined=False, truth=False)
     found = of_rrd(run_rrd.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
