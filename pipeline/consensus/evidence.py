@@ -215,16 +215,26 @@ def _shared(gaussians: Gaussians, information: MapInformation | None) -> Array:
     if information is not None and len(rows):
         deviation_m = np.zeros(len(gaussians))
         deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
-        sums = mean_block(packed)
-        known = (sums != 0).any(axis=(1, 2), keepdims=True)
-        across = known * _across_surface(gaussians, deviation_m)
-        position = add_covariance(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
+        position = stated_positions(gaussians, mean_block(packed), deviation_m)
         shape = add_covariance(log_covariance_block(packed), SHAPE_FLOOR**2 * np.eye(6))
         packed[:, MEAN_INFORMATION], packed[:, LOG_COVARIANCE_INFORMATION] = (
             pack_symmetric(position),
             pack_symmetric(shape),
         )
     return packed
+
+
+def stated_positions(gaussians: Gaussians, sums: Array, deviation_m: Array) -> Array:
+    """Information [n, 3, 3], 1/m^2, of the positions of a robot's own Gaussians as `Evidence.from_map` states it.
+
+    Args:
+        gaussians: its map.
+        sums: position blocks of the Fisher sums [n, 3, 3], in the same frame; none stays none.
+        deviation_m: of the means from the measured surface [n].
+    """
+    known = (sums != 0).any(axis=(1, 2), keepdims=True)
+    across = known * _across_surface(gaussians, deviation_m)
+    return add_covariance(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
 
 
 def _rendered(gaussians: Gaussians, information: MapInformation | None) -> Array:

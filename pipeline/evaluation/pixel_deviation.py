@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
+from duagc.pipeline.consensus.evidence import rows_by_id, stated_positions
 from duagc.pipeline.evaluation.rendering import in_world
 from duagc.pipeline.evaluation.views import surface_depth
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.messages import GaussianMap
+from duagc.pipeline.messages import GaussianInformation, GaussianMap
 from duagc.pipeline.runs.folder import RobotRun, position_information
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -86,9 +86,12 @@ def stated_own(robot: RobotRun, unknown_m: float) -> StatedMap:
         robot: of a run.
         unknown_m: standard deviation of a Gaussian of which nothing is stated.
     """
-    own, T_map_keyframe = robot.own_map, np.array([k.T_map_camera for k in robot.keyframes])
-    evidence = Evidence.from_map(robot.robot, own.gaussians, robot.information, T_map_keyframe)
-    return _stated(own, evidence.in_world(T_map_keyframe).position_information(), unknown_m)
+    own, information = robot.own_map, robot.information
+    rows = rows_by_id(own.gaussians.ids, information.ids)
+    deviation_m = np.zeros(len(rows))
+    deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
+    sums = _of_rows(information, rows)
+    return _stated(own, stated_positions(own.gaussians, sums, deviation_m), unknown_m)
 
 
 def stated_in_world(robot: RobotRun, shown: GaussianMap, unknown_m: float) -> StatedMap:
@@ -100,16 +103,22 @@ def stated_in_world(robot: RobotRun, shown: GaussianMap, unknown_m: float) -> St
         unknown_m: standard deviation of a Gaussian of which nothing is stated.
     """
     information = robot.fused_map.information
-    F = np.zeros((len(shown.gaussians), 3, 3))
-    if information is not None:
-        rows = rows_by_id(shown.gaussians.ids, information.ids)
-        F[rows >= 0] = position_information(information.geometry[rows[rows >= 0]])
-    return _stated(shown, F, unknown_m)
+    if information is None:
+        return _stated(shown, np.zeros((len(shown.gaussians), 3, 3)), unknown_m)
+    rows = rows_by_id(shown.gaussians.ids, information.ids)
+    return _stated(shown, _of_rows(information, rows), unknown_m)
 
 
 def own_in_world(robot: RobotRun, own: StatedMap) -> StatedMap:
     """The own map where consensus puts its keyframes: what is stated along a normal moves with it."""
     return StatedMap(in_world(robot, "own", own.gaussians), own.sigma_m, own.depth)
+
+
+def _of_rows(information: GaussianInformation, rows: NDArray[np.int64]) -> Array:
+    """Position blocks [n, 3, 3] of some rows; zero for row -1."""
+    blocks = np.zeros((len(rows), 3, 3))
+    blocks[rows >= 0] = position_information(information.geometry[rows[rows >= 0]])
+    return blocks
 
 
 def _stated(shown: GaussianMap, information: Array, unknown_m: float) -> StatedMap:

@@ -40,7 +40,7 @@ from duagc.pipeline.runs.folder import RobotRun, RunFolder
 
 MAPS = ("own", "refined")
 SETS = ("held_out", "peers")
-MOST_VIEWS = 8
+MOST_VIEWS = 6
 """Of a set: enough for numbers good to a hundredth, in a few percent of the time that scoring renders takes."""
 EVERY_PX = 8
 """One pixel of every second block of 4 x 4 in both directions: such blocks are what the rasterizer can leave out."""
