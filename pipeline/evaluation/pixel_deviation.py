@@ -30,6 +30,8 @@ WORST_CONDITION = 1e12
 """Of the information of a position; a direction of one that is worse is not determined in float64."""
 LEAST_ACROSS = 0.1
 """Of a ray of depth one, along a normal: a disc seen more from the side, by 84 degrees, is no surface for the ray."""
+LEAST_STATED = 0.5
+"""Share of a pixel's alpha of which something must be stated."""
 NEAREST_M = 0.05
 """Depth of a center up to which its ray says nothing; as near as the rasterizer draws is farther."""
 
@@ -40,7 +42,8 @@ class StatedMap:
 
     Attributes:
         gaussians: n.
-        sigma_m: standard deviation of every mean along the normal of its disc, meters [n].
+        sigma_m: standard deviation of every mean along the normal of its disc, meters [n]; infinite where none is
+            stated.
         depth: of a Gaussian at a pixel, as the map was made.
     """
 
@@ -55,7 +58,12 @@ class StatedMap:
 
 @dataclass(frozen=True)
 class RenderedDepth:
-    """Images [h, w] in meters: depth, 0 where alpha is below 0.5, and its standard deviation, 0 likewise."""
+    """Images [h, w] in meters.
+
+    Attributes:
+        depth_m: 0 where alpha is below 0.5.
+        sigma_m: its standard deviation; 0 likewise, and where less than half of alpha is of Gaussians that have one.
+    """
 
     depth_m: NDArray[np.float32]
     sigma_m: NDArray[np.float32]
@@ -79,34 +87,35 @@ def sigma_along(information: Array, directions: Array) -> tuple[Array, NDArray[n
     return sigma, determined
 
 
-def stated_own(robot: RobotRun, unknown_m: float) -> StatedMap:
+def stated_own(robot: RobotRun) -> StatedMap:
     """A robot's own map in its map frame, with what it tells its peers of it.
 
     Args:
         robot: of a run.
-        unknown_m: standard deviation of a Gaussian of which nothing is stated.
     """
     own, information = robot.own_map, robot.information
     rows = rows_by_id(own.gaussians.ids, information.ids)
     deviation_m = np.zeros(len(rows))
     deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
     sums = _of_rows(information, rows)
-    return _stated(own, stated_positions(own.gaussians, sums, deviation_m), unknown_m)
+    return _stated(own, stated_positions(own.gaussians, sums, deviation_m))
 
 
-def stated_in_world(robot: RobotRun, shown: GaussianMap, unknown_m: float) -> StatedMap:
-    """The fused or the final map of a robot; training after fusion does not change what is stated of a Gaussian.
+def stated_in_world(robot: RobotRun, shown: GaussianMap) -> StatedMap:
+    """The fused or the final map of a robot.
+
+    Training after fusion does not change what is stated of a Gaussian. Of those that a final map takes from a peer in
+    the place of own ones, the files of a run state nothing.
 
     Args:
         robot: of a run.
         shown: one of these maps of it.
-        unknown_m: standard deviation of a Gaussian of which nothing is stated.
     """
     information = robot.fused_map.information
     if information is None:
-        return _stated(shown, np.zeros((len(shown.gaussians), 3, 3)), unknown_m)
+        return _stated(shown, np.zeros((len(shown.gaussians), 3, 3)))
     rows = rows_by_id(shown.gaussians.ids, information.ids)
-    return _stated(shown, _of_rows(information, rows), unknown_m)
+    return _stated(shown, _of_rows(information, rows))
 
 
 def own_in_world(robot: RobotRun, own: StatedMap) -> StatedMap:
@@ -121,9 +130,8 @@ def _of_rows(information: GaussianInformation, rows: NDArray[np.int64]) -> Array
     return blocks
 
 
-def _stated(shown: GaussianMap, information: Array, unknown_m: float) -> StatedMap:
-    sigma_m, known = sigma_along(information, shown.gaussians.normals())
-    return StatedMap(shown.gaussians, np.where(known, sigma_m, unknown_m), shown.depth)
+def _stated(shown: GaussianMap, information: Array) -> StatedMap:
+    return StatedMap(shown.gaussians, sigma_along(information, shown.gaussians.normals())[0], shown.depth)
 
 
 def rendered_depth(
@@ -138,8 +146,9 @@ def rendered_depth(
 
     Moved by its deviation along its normal n, a Gaussian moves by sigma / |n r| along the ray r of depth one. However
     the errors of Gaussians go together, their mean by blending weight deviates by no more than the mean of their
-    deviations, which is drawn as a color. Where the pixel blends surfaces, the blended depth is that of neither: the
-    difference from the depth of the layer that stops half of the light counts in quadrature.
+    deviations, which is drawn as a color; Gaussians without one are left out of it. Where the pixel blends surfaces,
+    the blended depth is that of neither: the difference from the depth of the layer that stops half of the light
+    counts in quadrature.
 
     Args:
         rasterizer: draws.
@@ -149,16 +158,16 @@ def rendered_depth(
         mask: bool [h, w], pixels that are drawn; the others are 0. None: all.
     """
     T = np.asarray(T_camera_map, dtype=np.float64)
-    along_ray_m = _along_rays(stated, T).astype(np.float32)
-    colors = np.repeat(along_ray_m[:, None], 3, axis=1)
-    gaussians = stated.gaussians.replace(colors=colors)
+    known = np.isfinite(stated.sigma_m)
+    along_ray_m = np.where(known, _along_rays(stated, T), 0.0)
+    gaussians = stated.gaussians.replace(colors=np.stack([along_ray_m, known, known], axis=1))
     render = rasterizer.forward(gaussians, camera, T, depth_kind=stated.depth, mask=mask)
     layer_m, depth_m = rasterizer.layer_depth(), surface_depth(render)
     sigma_m = np.zeros_like(depth_m)
-    drawn = depth_m > 0
-    blended_m = render.color[..., 0][drawn] / render.alpha[drawn]
+    weight = render.color[..., 1]
+    drawn = (depth_m > 0) & (weight >= LEAST_STATED * render.alpha)
     between_m = np.where(layer_m[drawn] > 0, depth_m[drawn] - layer_m[drawn], 0.0)
-    sigma_m[drawn] = np.hypot(blended_m, between_m)
+    sigma_m[drawn] = np.hypot(render.color[..., 0][drawn] / weight[drawn], between_m)
     return RenderedDepth(depth_m, sigma_m)
 
 

@@ -46,8 +46,8 @@ EVERY_PX = 8
 """One pixel of every second block of 4 x 4 in both directions: such blocks are what the rasterizer can leave out."""
 MIN_PIXELS = 100
 NAMES = (
-    "pixels", "median_error_m", "median_sigma_m", "spearman", "ece_rank", "ece_rank_if_right", "ece_rank_shuffled",
-    "coverage_95", "nll", "sigma_scale", "coverage_95_scaled", "nll_scaled",
+    "pixels", "pixels_without_sigma", "median_error_m", "median_sigma_m", "spearman", "ece_rank",
+    "ece_rank_if_right", "ece_rank_shuffled", "coverage_95", "nll", "sigma_scale", "coverage_95_scaled", "nll_scaled",
 )  # fmt: skip
 Scores = dict[str, dict[str, dict[str, Any]]]
 """Numbers by map and set of views."""
@@ -60,10 +60,12 @@ class PixelErrors:
     Attributes:
         error_m: difference of rendered and true depth [n], absolute.
         sigma_m: predicted standard deviation of that difference [n].
+        without_sigma: pixels left out, because too little is stated of what they blend.
     """
 
     error_m: Array
     sigma_m: Array
+    without_sigma: int
 
 
 def scores_of_robot(run: RunFolder, source: Recording, name: str, *, threads: int) -> Scores:
@@ -76,10 +78,9 @@ def scores_of_robot(run: RunFolder, source: Recording, name: str, *, threads: in
         threads: views rendered at the same time; changes no bit of the result.
     """
     robot, settings = run.robots[name], run.config.information
-    noise, gate_m = stated_noise(settings), settings.deviation_gate_m
-    stated = {"own": stated_own(robot, gate_m)}
+    noise, stated = stated_noise(settings), {"own": stated_own(robot)}
     if robot.refined_map is not None:
-        stated["refined"] = stated_in_world(robot, robot.refined_map, gate_m)
+        stated["refined"] = stated_in_world(robot, robot.refined_map)
     found: dict[tuple[str, str], list[PixelErrors]] = {(kind, s): [] for kind in stated for s in SETS}
 
     def add(view_set: str, views: _Views) -> None:
@@ -151,9 +152,11 @@ class _Views:
         """The errors of a view at the sampled pixels, against exact depth where there is some, else recorded depth."""
         true_m, sensor_m = true_depth(view, self.noise)
         true, z, sigma_m = true_m[sample], rendered.depth_m[sample], rendered.sigma_m[sample]
-        both = (true > 0) & (z > 0)
+        compared = (true > 0) & (z > 0)
+        both = compared & (sigma_m > 0)
         error_m = np.abs(z[both].astype(np.float64) - true[both])
-        return PixelErrors(error_m, np.hypot(sigma_m[both].astype(np.float64), sensor_m[sample][both]))
+        predicted_m = np.hypot(sigma_m[both].astype(np.float64), sensor_m[sample][both])
+        return PixelErrors(error_m, predicted_m, int(np.count_nonzero(compared & ~both)))
 
 
 def stated_noise(settings: InformationConfig) -> DepthNoise:
@@ -185,17 +188,18 @@ def _scores(errors: Sequence[PixelErrors], name: str, reason_if_none: str) -> di
         return dict.fromkeys(NAMES, Absent(reason_if_none))
     sigma, error = np.concatenate([e.sigma_m for e in errors]), np.concatenate([e.error_m for e in errors])
     fitting = np.concatenate([np.full(len(e.error_m), k % 2 == 0) for k, e in enumerate(errors)])
+    counts = {"pixels": len(error), "pixels_without_sigma": sum(e.without_sigma for e in errors)}
     if len(error) < MIN_PIXELS or fitting.all() or not fitting.any():
         absent = Absent(
             f"fewer than {MIN_PIXELS} pixels, or of one view alone, have a rendered and a true depth"
         )
-        return dict.fromkeys(NAMES, absent) | {"pixels": len(error)}
+        return dict.fromkeys(NAMES, absent) | counts
     scale = uncertainty_calibration.fitted_scale(sigma[fitting], error[fitting])
     judged = scale * sigma[~fitting], error[~fitting]
     if_right = uncertainty_calibration.if_right(sigma, name)
     shuffled = uncertainty_calibration.shuffled(sigma, name)
     return {
-        "pixels": len(error),
+        **counts,
         "median_error_m": float(np.median(error)),
         "median_sigma_m": float(np.median(sigma)),
         "spearman": uncertainty_calibration.spearman(sigma, error),
@@ -219,7 +223,7 @@ def team_scores(robots: Collection[Scores]) -> Scores:
 
 
 def _together(key: str, values: list[float | Absent]) -> float | Absent:
-    if key != "pixels":
+    if not key.startswith("pixels"):
         return mean(values)
     counts = [v for v in values if not isinstance(v, Absent)]
     return int(sum(counts)) if counts else values[0]

@@ -36,8 +36,8 @@ _CALIBRATION = (
 )
 
 _PIXELS = (
-    "pixels median_error_m median_sigma_m spearman ece_rank ece_rank_if_right ece_rank_shuffled coverage_95 nll "
-    "sigma_scale coverage_95_scaled nll_scaled"
+    "pixels pixels_without_sigma median_error_m median_sigma_m spearman ece_rank ece_rank_if_right "
+    "ece_rank_shuffled coverage_95 nll sigma_scale coverage_95_scaled nll_scaled"
 )
 
 

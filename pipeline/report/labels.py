@@ -165,6 +165,7 @@ CALIBRATION = {
 
 PIXEL_CALIBRATION = {
     "pixels": ("Pixels", "judged, all robots"),
+    "pixels_without_sigma": ("Left out", "pixels of whose Gaussians too little is stated"),
     "median_error_m": ("Error", "median absolute difference of rendered and true depth"),
     "median_sigma_m": ("σ", "median predicted standard deviation of it"),
     "coverage_95": ("Coverage of 95 %", "share of errors within 1.96 predicted σ"),

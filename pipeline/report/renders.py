@@ -88,14 +88,13 @@ def _views_of(run: RunFolder, source: Recording, name: str, number: int) -> tupl
         shown += [head | view for view in _own_views(robot, log, frames, rasterizer)]
         if frames:
             kind, final = _final(robot)
-            settings = run.config.information
             predicted = _deviation_view(
-                stated_in_world(robot, final, settings.deviation_gate_m),
+                stated_in_world(robot, final),
                 robot.trajectory,
                 log,
                 [_compared(frame, source, name) for frame in frames],
                 kind=kind,
-                noise=stated_noise(settings),
+                noise=stated_noise(run.config.information),
                 rasterizer=rasterizer,
             )
             deviations.append(head | predicted)
@@ -252,7 +251,7 @@ def _deviation_view(
         frame = view.frame
         recorded_m, sensor_m = true_depth(view, noise)
         rendered = rendered_depth(rasterizer, stated, log.camera, se3.inverse(poses[frame.stamp_ns]))
-        both = (recorded_m > 0) & (rendered.depth_m > 0)
+        both = (recorded_m > 0) & (rendered.sigma_m > 0)
         predicted_m = np.hypot(rendered.sigma_m, sensor_m)
         ends.append(float(np.percentile(predicted_m[both], 95)) if both.any() else 0.0)
         shown.append((frame, both, predicted_m, np.abs(rendered.depth_m - recorded_m)))

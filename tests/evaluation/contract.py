@@ -48,7 +48,7 @@ SCHEMA = {
         NUMBER,
     ),
     "pixel_calibration": {
-        kind: {view_set: {"pixels": int} | dict.fromkeys(
+        kind: {view_set: {"pixels": int, "pixels_without_sigma": int} | dict.fromkeys(
             ("median_error_m", "median_sigma_m", "spearman", "ece_rank", "ece_rank_if_right", "ece_rank_shuffled",
              "coverage_95", "nll", "sigma_scale", "coverage_95_scaled", "nll_scaled"), NUMBER,
         ) for view_set in ("held_out", "peers")} for kind in ("own", "refined")

@@ -69,6 +69,18 @@ def test_a_pixel_that_blends_two_surfaces_deviates_by_what_that_shifts_it():
     assert found.sigma_m[MIDDLE] == pytest.approx(shift_m, rel=1e-3)
 
 
+def test_gaussians_of_which_nothing_is_stated_are_left_out():
+    gaussians = wall(2.0)
+    sigma_m = np.full(len(gaussians), 0.004)
+    sigma_m[::3] = np.inf  # columns in turn: a third of what a pixel blends
+    found = rendered_depth(Rasterizer(), StatedMap(gaussians, sigma_m, "ray_plane"), CAMERA, np.eye(4))
+    assert found.sigma_m[MIDDLE] == pytest.approx(0.004, rel=1e-3)
+    sigma_m[gaussians.means[:, 0] < 0] = np.inf
+    found = rendered_depth(Rasterizer(), StatedMap(gaussians, sigma_m, "ray_plane"), CAMERA, np.eye(4))
+    assert (found.sigma_m[:, :26] == 0).all()
+    assert (found.depth_m > 0).all()
+
+
 def test_what_is_not_drawn_has_neither_depth_nor_deviation():
     gaussians = wall(2.0, x_from=0.5)
     found = rendered_depth(
