@@ -88,7 +88,7 @@ def sigma_along(information: Array, directions: Array) -> tuple[Array, NDArray[n
 
 
 def stated_own(robot: RobotRun) -> StatedMap:
-    """A robot's own map in its map frame, with what it tells its peers of it.
+    """A robot's own map in its map frame, with what it states of it to its peers.
 
     Args:
         robot: of a run.
