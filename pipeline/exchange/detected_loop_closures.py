@@ -7,6 +7,9 @@
     SAMPLE       one per requested keyframe           ->                                              } it is worth it
                                                       <- CLOSURES  verdict, shared keyframes
 
+What was verified says where further views should overlap, and the search goes on there: with samples that are here
+already, or with others if they are worth their bytes.
+
 The verifier is the end with the lower digest (and name, should they be equal): the end that verifies decides which of
 two measurements counts, and that must not depend on names. It keeps the loop closures. It has decided when its verdict
 has been acknowledged, the provider when the verdict has arrived.
@@ -38,14 +41,15 @@ from duagc.pipeline.exchange.loop_closing import (
 from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
+from duagc.pipeline.exchange.view_overlap import overlaps
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import DescriptorSet, KeyframeSample, Verdicts
 from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.posegraph.loop_closures import Group, KeyframePoses, consistent, drift
-from duagc.pipeline.posegraph.relative_poses import RelativePoses
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
 from duagc.pipeline.posegraph.surface_agreement import coarse_depth, surface_agreement
 from duagc.pipeline.registration import Reference, RgbdPyramid
-from duagc.pipeline.registration.features import Features, extract
+from duagc.pipeline.registration.features import Descriptors, Features, extract, matches
 from duagc.pipeline.runs.robot_data import RobotData
 
 VERIFIER_KINDS = frozenset({Kind.DESCRIPTORS, Kind.SAMPLE})
@@ -97,6 +101,10 @@ class KeyframeDatabase:
             T_ownmap_keyframe=self.graph.T_first_keyframe,
             T_ownmap_peer=T_first_peer,
         )
+
+    def overlaps(self, closures: Sequence[LoopClosure], peer: KeyframePoses) -> dict[tuple[int, int], float]:
+        """How much of own views a neighbor's keyframes should see, by both, near loop closures with it."""
+        return overlaps(closures, self._coarse_depths, self.data.camera, own=self.graph.from_first, peer=peer)
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
         """Images of a keyframe at several resolutions."""
@@ -202,7 +210,10 @@ class Verifier(LoopClosureProtocol):
         self.database, self.config, self.seed = database, database.config, seed
         self.planner: Planner | None = None
         self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbor
-        self.samples: dict[int, NDArray[np.floating]] = {}  # until decided: points [m, 3] of its keyframes
+        # of its keyframes, until decided: compact descriptors, those that resemble no own one, samples that arrived
+        self.compact: list[Descriptors] = []
+        self.unlike: list[Candidate] = []
+        self.samples: dict[int, KeyframeSample] = {}
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         if kind is Kind.DESCRIPTORS and self.peer_keyframes is None:
@@ -211,8 +222,9 @@ class Verifier(LoopClosureProtocol):
             sample = loop_closing_wire.read_sample(payload, len(self.peer_keyframes.drift))
             if sample.keyframe not in self.waiting:
                 raise MalformedError(f"sample of keyframe {sample.keyframe} was not requested, or came twice")
-            self.samples[sample.keyframe] = sample.reference.levels[0].points
-            self._verify(sample)
+            self.samples[sample.keyframe] = sample
+            for candidate in self.waiting.pop(sample.keyframe):
+                self._verify(candidate)
             if not self.waiting:
                 self._request(send)
         else:
@@ -221,13 +233,11 @@ class Verifier(LoopClosureProtocol):
     def _choose(self, received: DescriptorSet, send: Send) -> None:
         """Score all pairs of keyframes and request the samples of the most promising."""
         self.peer_keyframes = KeyframePoses(received.T_first_keyframe, received.drift)
+        self.compact = received.descriptors
         c = self.config.places
-        candidates, unlike = place_recognition.scored(
+        candidates, self.unlike = place_recognition.scored(
             self.database.features, received.descriptors, c.ratio, c.min_score
         )
-        for candidate in unlike:
-            detail = f"{candidate.score} descriptors match at best, {c.min_score} needed"
-            self.tried.append(Tried(candidate, Verified(Verdict.UNLIKE, 0, 0, detail)))
         self.planner = Planner(
             candidates,
             c,
@@ -238,29 +248,55 @@ class Verifier(LoopClosureProtocol):
         self._request(send)
 
     def _request(self, send: Send) -> None:
-        """Request what is worth most now; decide when nothing is worth a sample any more."""
+        """Verify what is worth most now, and request what that needs; decide when nothing is worth it any more."""
         assert self.planner is not None
-        for candidate in self.planner.next():
-            self.waiting.setdefault(candidate.peer_keyframe, []).append(candidate)
+        while not self.waiting:
+            self._search_again()
+            chosen = self.planner.next()
+            if not chosen:
+                break
+            for candidate in chosen:
+                if candidate.peer_keyframe in self.samples:
+                    self._verify(candidate)
+                else:
+                    self.waiting.setdefault(candidate.peer_keyframe, []).append(candidate)
         if self.waiting:
             send(Kind.REQUEST, loop_closing_wire.write_indices(sorted(self.waiting)))
             return
         for candidate, reason in self.planner.not_requested():
             self.tried.append(Tried(candidate, Verified(Verdict.NOT_REQUESTED, 0, 0, reason)))
+        for candidate in self.unlike:
+            if candidate.peer_keyframe not in self.samples:
+                detail = f"{candidate.score} descriptors match at best, {self.config.places.min_score} needed"
+                self.tried.append(Tried(candidate, Verified(Verdict.UNLIKE, 0, 0, detail)))
         self._decide(send)
 
-    def _verify(self, sample: KeyframeSample) -> None:
+    def _search_again(self) -> None:
+        """Look for further candidates near the loop closures that were verified, or near those that nearly were."""
         assert self.planner is not None
-        for candidate in self.waiting.pop(sample.keyframe):
-            ends = (self.database.features[candidate.own_keyframe], sample.features)
-            own, peer = (hashlib.sha256(f.descriptors.tobytes()).hexdigest() for f in ends)
-            rng = random_streams.generator(self.seed, "ransac", own=own, peer=peer)
-            result = self.database.recall(
-                f"{self.own} verifies {candidate.own_keyframe}, {self.peer} {candidate.peer_keyframe}",
-                partial(self._verified, candidate, sample, rng),
-            )
-            self.tried.append(Tried(candidate, result))
-            self.planner.take(candidate, result.closure is not None)
+        assert self.peer_keyframes is not None
+        results = [t.result for t in self.tried]
+        near = [r.closure for r in results if r.closure] or [r.tentative for r in results if r.tentative]
+        if near:
+            predicted = self.database.overlaps(near, self.peer_keyframes)
+            self.planner.expect(predicted, self._score)
+
+    def _score(self, own_keyframe: int, peer_keyframe: int) -> int:
+        own, ratio = self.database.features[own_keyframe], self.config.places.ratio
+        return len(matches(own.descriptors, self.compact[peer_keyframe], ratio))
+
+    def _verify(self, candidate: Candidate) -> None:
+        assert self.planner is not None
+        sample = self.samples[candidate.peer_keyframe]
+        ends = (self.database.features[candidate.own_keyframe], sample.features)
+        own, peer = (hashlib.sha256(f.descriptors.tobytes()).hexdigest() for f in ends)
+        rng = random_streams.generator(self.seed, "ransac", own=own, peer=peer)
+        result = self.database.recall(
+            f"{self.own} verifies {candidate.own_keyframe}, {self.peer} {candidate.peer_keyframe}",
+            partial(self._verified, candidate, sample, rng),
+        )
+        self.tried.append(Tried(candidate, result))
+        self.planner.take(candidate, result.closure is not None)
 
     def _verified(self, candidate: Candidate, sample: KeyframeSample, rng: np.random.Generator) -> Verified:
         own = candidate.own_keyframe
@@ -313,6 +349,7 @@ class Verifier(LoopClosureProtocol):
                 config=self.config.consensus.closures,
             )
         self.samples.clear()
+        self.compact = []
         verdicts = Verdicts(
             candidates=sum(t.result.verdict is not Verdict.UNLIKE for t in self.tried),
             verified=len(closures),
@@ -327,4 +364,5 @@ class Verifier(LoopClosureProtocol):
         """Share of the neighbor's samples that own depth images confirm, where a group places its map."""
         assert self.peer_keyframes is not None
         placed = group.T_ownmap_peermap @ self.peer_keyframes.T_frame_keyframe[sorted(self.samples)]
-        return self.database.agreement([self.samples[k] for k in sorted(self.samples)], placed)
+        points = [self.samples[k].reference.levels[0].points for k in sorted(self.samples)]
+        return self.database.agreement(points, placed)

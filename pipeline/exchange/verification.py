@@ -52,6 +52,7 @@ class Verified:
         inliers: matches that agree on one motion.
         detail: with numbers.
         closure: the loop closure, if the candidate was kept.
+        tentative: what matched features agree on where registration failed; its information is zero.
     """
 
     verdict: Verdict
@@ -59,6 +60,7 @@ class Verified:
     inliers: int
     detail: str = ""
     closure: LoopClosure | None = None
+    tentative: LoopClosure | None = None
 
 
 def verify(
@@ -95,12 +97,12 @@ def verify(
         rng=rng,
     )
     verdict, detail = _VERDICTS[found.failure], _detail(found)
-    closure = None
+    closure = tentative = None
     if found.failure is None:
-        closure = LoopClosure(
-            candidate.own_keyframe, candidate.peer_keyframe, found.T_first_second, found.information
-        )
-    return Verified(verdict, found.features.matches, found.features.inliers, detail, closure)
+        closure = LoopClosure(*candidate.ends, found.T_first_second, found.information)
+    elif found.features.T_first_second is not None and found.features.accepted:
+        tentative = LoopClosure(*candidate.ends, found.features.T_first_second, np.zeros((6, 6)))
+    return Verified(verdict, found.features.matches, found.features.inliers, detail, closure, tentative)
 
 
 def _verified_by_gicp(

@@ -166,8 +166,8 @@ def test_strangers_try_on_and_those_who_met_stop() -> None:
         while batch := plan.next():
             for c in batch:
                 plan.take(c, closure)
-    assert refused.requested == 20
-    assert kept.requested < 15
+    assert len(refused.requested) == 20
+    assert len(kept.requested) < 15
     assert all("nats, 1 needed" in reason for _, reason in kept.not_requested())
 
 
