@@ -25,6 +25,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.exchange import PlacesConfig
 from duagc.pipeline.registration.features import Descriptors, Features, matches
+from duagc.pipeline.registration.place_index import PlaceIndex
 
 FIRST_SIGMA = np.array([10.0, 1.0])  # of the relative frame before anything is known (m, rad)
 MOST_LIKELY = 0.95
@@ -72,6 +73,8 @@ def scored(
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Pairs of keyframes with at least `min_score` matches, best first; and those that come nearest for the rest.
 
+    Of many own keyframes those are compared that `PlaceIndex` gives.
+
     Args:
         own: all features of each own keyframe.
         peer: the compact descriptors of each keyframe of the neighbor.
@@ -82,8 +85,12 @@ def scored(
     """
     candidates: list[Candidate] = []
     unlike: list[Candidate] = []
+    index = PlaceIndex()
+    for features in own:
+        index.add(features.descriptors)
     for j, theirs in enumerate(peer):
-        scores = [Candidate(i, j, len(matches(o.descriptors, theirs, ratio))) for i, o in enumerate(own)]
+        alike = index.alike(theirs)
+        scores = [Candidate(i, j, len(matches(own[i].descriptors, theirs, ratio))) for i in alike]
         candidates += [c for c in scores if c.score >= min_score]
         if scores and max(c.score for c in scores) < min_score:
             unlike.append(max(scores, key=lambda c: (c.score, -c.own_keyframe)))

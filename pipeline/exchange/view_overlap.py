@@ -59,12 +59,12 @@ def overlaps(
                 found = nearest.setdefault(i, {}).get(j)
                 if found is None or between < found[0]:
                     nearest[i][j] = (float(between), c)
-    out = {}
+    out: dict[tuple[int, int], float] = {}
     for i, by_peer in sorted(nearest.items()):
         by = [by_peer[j][1] for j in sorted(by_peer)]
-        k, m = [c.own_keyframe for c in by], [c.peer_keyframe for c in by]
-        T_own_closure = se3.inverse(own.T_frame_keyframe[i]) @ own.T_frame_keyframe[k]
-        T_closure_peer = se3.inverse(peer.T_frame_keyframe[m]) @ peer.T_frame_keyframe[sorted(by_peer)]
+        ends = [c.own_keyframe for c in by], [c.peer_keyframe for c in by]
+        T_own_closure = se3.inverse(own.T_frame_keyframe[i]) @ own.T_frame_keyframe[ends[0]]
+        T_closure_peer = se3.inverse(peer.T_frame_keyframe[ends[1]]) @ peer.T_frame_keyframe[sorted(by_peer)]
         T_own_peer = T_own_closure @ np.array([c.T_own_peer for c in by]) @ T_closure_peer
         shares = shared_view(coarse_m[i], camera, T_own_peer)
         out |= {(i, j): share for j, share in zip(sorted(by_peer), shares.tolist(), strict=True)}

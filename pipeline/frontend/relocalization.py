@@ -20,10 +20,16 @@ from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.geometric_verification import motion_from_features
+from duagc.pipeline.registration.place_index import PlaceIndex
 
 
 def place_candidates(
-    view: Features, keyframes: Sequence[Features], frame_index: int, config: RelocalizationConfig
+    view: Features,
+    keyframes: Sequence[Features],
+    frame_index: int,
+    config: RelocalizationConfig,
+    *,
+    among: Sequence[int],
 ) -> Iterator[tuple[int, Array]]:
     """Keyframes that a view may show, the best first, each with the motion that its matched features agree on.
 
@@ -32,16 +38,16 @@ def place_candidates(
         keyframes: features of every keyframe.
         frame_index: names the random draws.
         config: how many are tried, and what they must share.
+        among: indices of the keyframes that are compared.
 
     Yields:
         Keyframe index and T_keyframe_camera [4, 4].
     """
     most = config.features_compared
-    scores = [
-        len(matches(f.descriptors[:most], view.descriptors[:most], config.ratio)) if len(f) else 0
-        for f in keyframes
-    ]
-    ranked = sorted(range(len(keyframes)), key=lambda k: (-scores[k], -k))
+    scores = {
+        k: len(matches(keyframes[k].descriptors[:most], view.descriptors[:most], config.ratio)) for k in among
+    }
+    ranked = sorted(among, key=lambda k: (-scores[k], -k))
     for k in ranked[: config.candidates]:
         if scores[k] < config.min_matches:
             return
@@ -66,6 +72,14 @@ class Relocalizer:
 
     def __init__(self) -> None:
         self._unconfirmed: _Unconfirmed | None = None
+        self._index = PlaceIndex()
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without the index, which follows from the keyframes: a copy makes its own."""
+        return {"_unconfirmed": self._unconfirmed}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__ |= state | {"_index": PlaceIndex()}
 
     def reset(self) -> None:
         """Forget the place that waits for confirmation."""
@@ -83,13 +97,19 @@ class Relocalizer:
             if confirmed is not None:
                 return confirmed
         nearby = register_nearby(state, frame)
-        place = nearby if isinstance(nearby, PoseCandidate) else find_place(state, frame)
+        place = nearby if isinstance(nearby, PoseCandidate) else self._find(state, frame)
         if place is None:
             return nearby if isinstance(nearby, Reason) else Reason.UNCONFIRMED
         if state.config.tracking.relocalization.confirmations == 0:
             return place
         self._unconfirmed = _Unconfirmed(place, frame.stamp_ns, 0)
         return Reason.UNCONFIRMED
+
+    def _find(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | None:
+        """The place of a frame among all keyframes."""
+        for keyframe in state.keyframes[len(self._index) :]:
+            self._index.add(keyframe.features.descriptors)
+        return find_place(state, frame, self._index.alike(frame.features.descriptors))
 
     def _confirm(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason | None:
         """Track on from a place that was found; None if the frame does not agree with it."""
@@ -127,17 +147,18 @@ def _starts(state: TrackingState, frame: CurrentFrame, keyframe_index: int, last
         yield moved.T_first_second
 
 
-def find_place(state: TrackingState, frame: CurrentFrame) -> PoseCandidate | None:
+def find_place(state: TrackingState, frame: CurrentFrame, among: Sequence[int]) -> PoseCandidate | None:
     """The first keyframe, in the order of matching features, that a frame can be registered to; None if there is none.
 
     Args:
         state: what the tracker knows.
         frame: the current frame.
+        among: indices of the keyframes that are compared.
     """
     tracking = state.config.tracking
     features = [keyframe.features for keyframe in state.keyframes]
     for index, guess in place_candidates(
-        frame.features, features, frame.frame_index, tracking.relocalization
+        frame.features, features, frame.frame_index, tracking.relocalization, among=among
     ):
         result = register_until_stable(
             state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration

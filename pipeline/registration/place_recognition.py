@@ -30,9 +30,7 @@ class Places:
         Args:
             views: descriptors of every view, uint8 [n, 128] each.
         """
-        # what all features have in common does not distinguish places
-        total = sum((d.sum(axis=0, dtype=np.int64) for d in views), np.zeros(DIMENSIONS, dtype=np.int64))
-        center = np.rint(total / max(sum(map(len, views)), 1)).astype(np.float32)
+        center = center_of(views)
         self._has = np.stack([_words(d.astype(np.float32) - center) for d in views])
 
     def alike(self, view: int, among: int, most: int) -> list[int]:
@@ -52,15 +50,34 @@ class Places:
         return sorted(np.argsort(-score, kind="stable")[:most].tolist())
 
 
+def center_of(views: Sequence[Descriptors]) -> NDArray[np.float32]:
+    """What the features of all views have in common, [128]; it does not distinguish places.
+
+    Args:
+        views: descriptors of every view, uint8 [n, 128] each.
+    """
+    total = sum((d.sum(axis=0, dtype=np.int64) for d in views), np.zeros(DIMENSIONS, dtype=np.int64))
+    return np.rint(total / max(sum(map(len, views)), 1)).astype(np.float32)
+
+
+def words_of(centered: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The word of every descriptor in every table, [n, TABLES], each below WORDS.
+
+    Args:
+        centered: descriptors [n, 128] without what all have in common.
+    """
+    words = np.zeros((len(centered), TABLES), dtype=np.int64)
+    for table, directions in enumerate(_DIRECTIONS):
+        along = centered @ directions
+        nearest = np.abs(along).argmax(axis=1)
+        words[:, table] = 2 * nearest + (along[np.arange(len(along)), nearest] > 0)
+    return words
+
+
 def _words(centered: NDArray[np.float32]) -> NDArray[np.float32]:
     """Which words descriptors [n, 128] have, [TABLES * WORDS], 0 or 1."""
     has = np.zeros((TABLES, WORDS), dtype=np.float32)
-    if len(centered):
-        for table, directions in enumerate(_DIRECTIONS):
-            along = centered @ directions
-            nearest = np.abs(along).argmax(axis=1)
-            positive = along[np.arange(len(along)), nearest] > 0
-            has[table, 2 * nearest + positive] = 1
+    has[np.arange(TABLES), words_of(centered)] = 1
     return has.ravel()
 
 
