@@ -45,7 +45,7 @@ class Candidate:
         own_keyframe: index of the own keyframe.
         peer_keyframe: index of the neighbor's keyframe.
         score: number of matching descriptors.
-        overlap: share of the own view that the other one should see; 0 if no loop closure tells.
+        overlap: share of the own view that the other one should see; 0 if no loop closure says so.
     """
 
     own_keyframe: int

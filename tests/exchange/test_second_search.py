@@ -69,7 +69,7 @@ def test_overlap_makes_a_pair_worth_a_sample_and_samples_at_hand_are_free() -> N
     assert plan.next() == []
     plan.expect({(8, 3): 0.9}, lambda i, j: 0)
     assert [c.ends for c in plan.next()] == [(8, 3)]
-    assert [c.ends for c, _ in plan.not_requested()] == [(7, 6)]  # enough matches to be told
+    assert [c.ends for c, _ in plan.not_requested()] == [(7, 6)]  # enough matches to be listed
 
 
 @pytest.fixture(scope="module")
