@@ -1,5 +1,7 @@
 """What a disturbed camera is compared with: the last good frame, the latest keyframe, and the prediction."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +11,7 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments import disturbances as d
 from duagc.pipeline.experiments.disturbances import Shot, Undisturbed
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.relocalization import by_latest_keyframe
+from duagc.pipeline.frontend.relocalization import Relocalizer, by_latest_keyframe
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate
@@ -146,3 +148,11 @@ def test_a_later_keyframe_that_has_the_camera_elsewhere_contradicts(run: Undistu
         tracker.state.lost, tracker.state.stamp_ns = True, run.shots[START].stamp_ns - 10**9
         place, found = _found_by_the_first(run, tracker)
         assert found == (place if agrees else None)
+
+
+def test_copied_and_stored_relocalizers_index_their_own_keyframes() -> None:
+    relocalizer = Relocalizer()
+    relocalizer._index.add(np.zeros((2, 128), np.uint8))
+    for other in (copy.copy(relocalizer), pickle.loads(pickle.dumps(relocalizer))):
+        assert len(other._index) == 0
+    assert len(relocalizer._index) == 1
