@@ -273,6 +273,7 @@ def measured(run_folder: RunFolder, recording: Recording) -> dict[str, Any]:
         "ate_team_m": metrics["team"]["ate_rmse_m"],
         "psnr_db": own["psnr_db"],
         "psnr_exposure_db": own["psnr_exposure_db"],
+        "psnr_moved_db": own["psnr_moved_db"],
         "robots": metrics["team"]["robots"],
         "joined": metrics["team"]["robots_in_largest_component"],
         "worst_good_m": worst_good_m(run_folder, recording),

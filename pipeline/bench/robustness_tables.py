@@ -19,6 +19,7 @@ HEAD = (
     "PSNR dB",
     "- clean",
     "in exposure",
+    "as moved",
     "joined",
     "components",
     "worst good mm",
@@ -42,7 +43,7 @@ def format_table(rows: Sequence[dict[str, Any]]) -> str:
         f"{PSNR_LOSS_DB:g} dB below it, one component, 99 % of matched Gaussians within {GAP_SIGMA:g} sigma of the "
         f"centralized answer; no pose called good farther than {1000 * WORST_M:g} mm from the truth. ATE: mean of "
         "the robots. PSNR: own maps, held-out views; in exposure: in the gain and offset of each half of the view "
-        "fitted on the other half."
+        "fitted on the other half; as moved: drawn with the motion of the camera while its shutter was open."
     )
     return "\n".join(lines)
 
@@ -70,6 +71,7 @@ def _cells(row: dict[str, Any], clean: dict[str, Any]) -> list[object]:
         _number(row["psnr_db"], 1, 2),
         _number(_difference(row["psnr_db"], clean["psnr_db"]), 1, 2) if compared else None,
         _number(row["psnr_exposure_db"], 1, 2),
+        _number(row["psnr_moved_db"], 1, 2),
         f"{row['joined']} of {row['robots']}",
         row["components"],
         _number(row["worst_good_m"], 1000, 1),

@@ -62,6 +62,9 @@ class SparseStepsConfig(Config):
     """Look at every second block of 4x4 pixels, and at the others when the view comes again."""
     closing: float = Field(default=0.005, ge=0.0, le=0.5)
     """The Gaussian that takes the light at a pixel below this share stops all that is left; 0: blend to the end."""
+    moving_from: float = Field(default=0.7, ge=0.0, le=1.0)
+    """Share of the steps after which views whose camera moves while its shutter is open are drawn from several places,
+    and by half of their blocks; 1: never."""
 
 
 class LearningRates(Config):

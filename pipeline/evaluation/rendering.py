@@ -33,6 +33,8 @@ CENTRAL = "central"
 """The map trained on all robots' images; it has a section where there is one (`central_map`)."""
 MOST_VIEWS = 40
 """Of a set, unless more are asked for."""
+APART_PX, MOST_MOMENTS = 1.5, 15
+"""Places from which a view is drawn whose camera moved: about as dense as pixels."""
 COMPARED_SETS = ("held_out", "peers", "team")
 NONE_MET = "no robot met another, or the settings train no final map"
 NOT_ASKED = "not asked for: duagc evaluate --own-longer"
@@ -283,7 +285,14 @@ def scored_frames(
             depth_m = frame.depth
         elif not isinstance(exact, Absent):
             depth_m = exact.get(frame.stamp_ns, Absent("the frame has no exact depth"))
-        yield views.ScoredFrame(frame, depth_m, robot.exposures.at(index))
+        moments = (
+            None
+            if log.shutter is None
+            else log.shutter.moments(
+                frame.stamp_ns, frame.usable_depth, log.camera, apart_px=APART_PX, most=MOST_MOMENTS
+            )
+        )
+        yield views.ScoredFrame(frame, depth_m, robot.exposures.at(index), moments)
 
 
 def poses_by_stamp(trajectory: Trajectory) -> dict[int, NDArray[np.float64]]:

@@ -43,6 +43,7 @@ class ViewScore:
 
     psnr_db: Score
     psnr_interpolated_db: Score
+    psnr_moved_db: Score
     psnr_exposure_db: Score
     psnr_exposure_left_db: Score
     psnr_exposure_right_db: Score
@@ -73,6 +74,7 @@ def score_view(
     common: NDArray[np.bool_] | None = None,
     mask: Mask | None = None,
     exposure: Exposure | None = None,
+    moved: Render | None = None,
     structure: SsimReference | None = None,
 ) -> ViewScore:
     """Compare a render with the image of the same pose, on the pixels that may be used.
@@ -86,7 +88,10 @@ def score_view(
         common: [h, w], pixels that the maps that this one is compared with cover, too; None: there are none.
         mask: bool [h, w], pixels that may be used: the others count in no score, and windows of SSIM that touch one
             are left out; None: all.
-        exposure: of the view, by frames other than it, for `psnr_interpolated_db` alone. None: as the map.
+        exposure: of the view, by frames other than it, for `psnr_interpolated_db` and `psnr_moved_db` alone. None: as
+            the map.
+        moved: the map as the camera saw it that moved while its shutter was open, for `psnr_moved_db` alone; None: it
+            stood still.
         structure: of the image in 0..1 and the mask, where several renders are compared with it; None: made here.
     """
     if mask is not None:
@@ -97,11 +102,11 @@ def score_view(
     ssim, ms_ssim = _structure(render, structure or SsimReference(image, mask), min(image.shape[:2]))
     psnr_db = _psnr(render, image, mask)
     fitted = _psnr_in_fitted_exposure(render, image, mask)
+    interpolated_db = psnr_db if exposure is None else _psnr(in_exposure(render, exposure), image, mask)
     return ViewScore(
         psnr_db=psnr_db,
-        psnr_interpolated_db=psnr_db
-        if exposure is None
-        else _psnr(in_exposure(render, exposure), image, mask),
+        psnr_interpolated_db=interpolated_db,
+        psnr_moved_db=interpolated_db if moved is None else _psnr(in_exposure(moved, exposure), image, mask),
         psnr_exposure_db=fitted[0],
         psnr_exposure_left_db=fitted[1],
         psnr_exposure_right_db=fitted[2],
@@ -194,11 +199,14 @@ class ScoredFrame:
         frame: its image and depth.
         exact_depth_m: [h, w] in meters, or Absent with the reason.
         exposure: of the frame, as its robot knows it from other frames; None: as the map.
+        T_camera_moment: [k, 4, 4], where the camera was while its shutter was open, as its robot knows it, seen from
+            the middle; None: it stood still.
     """
 
     frame: RgbdFrame
     exact_depth_m: Any
     exposure: Exposure | None = None
+    T_camera_moment: NDArray[np.float64] | None = None
 
 
 def score_maps(
@@ -223,6 +231,7 @@ def score_maps(
         Frame index and scores by the maps' names.
     """
     from duagc.pipeline.kernels import Rasterizer
+    from duagc.pipeline.kernels.moving_views import draw_moving
 
     own = local()
 
@@ -234,14 +243,18 @@ def score_maps(
             T = poses.get(frame.stamp_ns)
             if T is not None:
                 render = own.rasterizer.forward(gaussians, camera, se3.inverse(T), depth_kind=depth)
-                drawn[name] = render, own.rasterizer.layer_depth()
+                layer_m, moved = own.rasterizer.layer_depth(), None
+                if view.T_camera_moment is not None:
+                    passed = T @ view.T_camera_moment
+                    moved = draw_moving(own.rasterizer, gaussians, camera, passed, depth_kind=depth)
+                drawn[name] = render, layer_m, moved
         structure = SsimReference(frame.color.astype(np.float64) / 255.0, frame.mask)
         together = [drawn[name][0].alpha >= MIN_ALPHA for name in compared if name in drawn]
         common = np.logical_and.reduce(together) if len(together) > 1 else None
         scores: dict[str, ViewScore | Absent] = dict.fromkeys(
             maps, Absent("the trajectory has no pose of this frame")
         )
-        for name, (render, layer_m) in drawn.items():
+        for name, (render, layer_m, moved) in drawn.items():
             scores[name] = score_view(
                 render,
                 frame.color,
@@ -251,6 +264,7 @@ def score_maps(
                 common=common,
                 mask=frame.mask,
                 exposure=view.exposure,
+                moved=moved,
                 structure=structure,
             )
         return frame.index, scores
@@ -274,6 +288,7 @@ def summary(scores: Sequence[ViewScore | Absent], reason_if_none: str) -> dict[s
         "views_without_pose": len(scores) - len(rendered),
         "psnr_db": means["psnr_db"],
         "psnr_interpolated_db": means["psnr_interpolated_db"],
+        "psnr_moved_db": means["psnr_moved_db"],
         "psnr_exposure_db": means["psnr_exposure_db"],
         "psnr_exposure_left_db": means["psnr_exposure_left_db"],
         "psnr_exposure_right_db": means["psnr_exposure_right_db"],

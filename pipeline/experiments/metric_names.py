@@ -18,7 +18,7 @@ _TEAM = (
     "inter_robot_loop_closures_rejected"
 )
 _VIEWS = (
-    "views views_without_pose psnr_db psnr_interpolated_db psnr_exposure_db ssim ms_ssim depth_l1_m "
+    "views views_without_pose psnr_db psnr_interpolated_db psnr_moved_db psnr_exposure_db ssim ms_ssim depth_l1_m "
     "depth_l1_exact_m depth_l1_layer_m depth_l1_common_m depth_completeness"
 )
 _EXCHANGE = (

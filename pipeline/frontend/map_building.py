@@ -18,7 +18,6 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.frontend import FrontendConfig
-from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.joint_training import JointTraining, JointView
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
@@ -26,10 +25,11 @@ from duagc.pipeline.frontend.mapping_budget import MappingBudget, alone_steps
 from duagc.pipeline.frontend.mapping_views import masked_depth
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.output import BuiltMap, Maps
+from duagc.pipeline.frontend.shutter import ShutterSearch
 from duagc.pipeline.frontend.supporting_frames import supporting_frames
 from duagc.pipeline.frontend.tile_checkpoints import TileCheckpoints
 from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_tile
-from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.tracked import TrackedFrame, tracked_path
 from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.exposure import ExposureTrack
@@ -96,20 +96,28 @@ class MapBuilder:
             clock: its laps get the times of the parts.
         """
         self._look(keyframes)
-        save = self._checkpoints
+        save, config, threads = self._checkpoints, self.config, self._threads
         updates, state = save.done(f"{self.name}.mapping", self._grown)
         self._whole.go_on(state)
         del state  # or it would be in memory twice
         unrefined = self._whole.gaussians
         clock.lap("mapping_s")
-        supporting = supporting_frames(frames, keyframes, self.config, tiles=len(self._tiles))
+        supporting = supporting_frames(frames, keyframes, config, tiles=len(self._tiles))
+        path = tracked_path(frames, np.array([k.T_map_camera for k in keyframes]))
+        search = ShutterSearch(
+            self.log, config.mapping, path, self._posed, depth=self._depth, threads=threads
+        )
+        shutter_s = save.done(
+            f"{self.name}.shutter", lambda: search.run(self._whole.gaussians, supporting, keyframes)
+        )
+        self.log.open_shutter(shutter_s, path)
         log_s = 1e-9 * (frames[-1].stamp_ns - frames[0].stamp_ns)
         stats, self._poses, state = save.done(
             f"{self.name}.final", lambda: self._finalized(supporting, log_s)
         )
         self._whole.go_on(state)
         del state
-        updates.append(self._update(keyframes[-1], stats, len(self._whole)))
+        updates.append(stats.message(keyframes[-1], self.name, len(self._whole)))
         clock.lap("final_refinement_s")
         maps = Maps(self._whole.gaussians, unrefined, self._depth)
         before = np.array([k.T_map_camera for k in keyframes])
@@ -118,7 +126,7 @@ class MapBuilder:
             frames = moved_frames(frames, before, after, self._poses)
         registered = self._registered(frames, after, frozenset(self._poses))
         clock.lap("model_s")
-        return BuiltMap(updates, maps, registered, after)
+        return BuiltMap(updates, maps, registered, after, shutter_s)
 
     def _look(self, keyframes: Sequence[Keyframe]) -> None:
         """Look at all keyframes once: what moves in them, how far they see, and which make a tile."""
@@ -159,7 +167,7 @@ class MapBuilder:
             for k in progress_bar.track(left, f"mapping {self.name}") if self._progress else left:
                 add = partial(mapper.add_keyframe, iterations=steps[k])
                 stats = self._with_images(add, k)
-                updates.append(self._update(self._keyframes[k], stats, len(self._whole) + stats.total))
+                updates.append(stats.message(self._keyframes[k], self.name, len(self._whole) + stats.total))
                 self._checkpoints.at(
                     part,
                     len(updates),
@@ -254,6 +262,11 @@ class MapBuilder:
                     self._with_images(mapper.put_back, k)
             for frame in of_tile[number]:
                 self._support(mapper, frame)
+            views = [
+                *(self._keyframes[k].frame_index for k in tile),
+                *(f.frame_index for f in of_tile[number]),
+            ]
+            mapper.open_shutter([self._moments(index) for index in views])
             others = (number, self._whole.state(), self._poses, all_stats)
             before = sum(alone[:number])
             save = TileCheckpoints(self._checkpoints, others, found=found, before=before, total=steps)
@@ -301,13 +314,26 @@ class MapBuilder:
     ) -> JointView:
         """A view, whose images are read when they are looked at; what moves is known by its pose before refinement."""
 
-        def read() -> PosedRgbd:
-            frame = self.log.frame(frame_index)
-            mask = self._free.usable(frame.usable_depth, T_map_tracked, frame.mask)
-            depth_m, exposure = masked_depth(frame.depth, mask), self.exposures.at(frame_index)
-            return PosedRgbd(frame.color, depth_m, T_map_tracked, mask, frame.depth_sigma, exposure)
-
+        read = partial(self._posed, frame_index, T_map_tracked)
         return JointView(frame_index, self._poses[frame_index], information, fixed, read)
+
+    def _posed(self, frame_index: int, T_map_tracked: Array) -> PosedRgbd:
+        """A frame at its pose before refinement, by which it is known what moves."""
+        frame = self.log.frame(frame_index)
+        mask = self._free.usable(frame.usable_depth, T_map_tracked, frame.mask)
+        return PosedRgbd(
+            frame.color,
+            masked_depth(frame.depth, mask),
+            T_map_tracked,
+            mask,
+            frame.depth_sigma,
+            self.exposures.at(frame_index),
+            frame.T_camera_moment,
+        )
+
+    def _moments(self, frame_index: int) -> Array | None:
+        """Where the camera is while its shutter is open, seen from the middle; None: it stands still."""
+        return None if self.log.shutter is None else self.log.frame(frame_index).T_camera_moment
 
     def _left_out(self, steps: int, wanted: int, which: str, setting: str) -> None:
         """Say what a budget leaves out."""
@@ -369,25 +395,5 @@ class MapBuilder:
             registration=self.config.tracking.registration,
             threads=self._threads,
         )
-        reasons = {Reason.NO_DEPTH} if self._depth == "ray_plane" else {Reason.NO_DEPTH, Reason.NONE}
-
-        def registered(frame: TrackedFrame) -> TrackedFrame:
-            if frame.status is not Status.LOST and frame.reason in reasons and frame.frame_index not in views:
-                images = self.log.frame(frame.frame_index)
-                return model.register(frame, images, T_map_keyframe[frame.keyframe_index])
-            return frame
-
-        return self._checkpoints.each(f"{self.name}.model", frames, registered)
-
-    def _update(self, keyframe: Keyframe, stats: MappingStats, total: int) -> MapUpdate:
-        """The message about a step of mapping, after which the map has so many Gaussians."""
-        return MapUpdate(
-            stamp_ns=keyframe.stamp_ns,
-            robot=self.name,
-            keyframe_index=keyframe.keyframe_index,
-            inserted=stats.inserted,
-            pruned=stats.pruned,
-            total=total,
-            loss_before=stats.loss_before,
-            loss_after=stats.loss_after,
-        )
+        register = partial(model.register_if_worth, log=self.log, T_map_keyframe=T_map_keyframe, views=views)
+        return self._checkpoints.each(f"{self.name}.model", frames, register)

@@ -71,6 +71,15 @@ class MapContent:
         """Poses [m, 4, 4] of the supporting frames, in the order in which they were added; `finalize` refines them."""
         return np.array([view.T_map_camera for view in self._support]).reshape(-1, 4, 4)
 
+    def open_shutter(self, moments: Sequence[NDArray[np.float64] | None]) -> None:
+        """Say where the camera is while its shutter is open.
+
+        Args:
+            moments: T_camera_moment [k, 4, 4] of keyframes and supporting frames, as of `TrainingView`.
+        """
+        for view, T_camera_moment in zip((*self._views, *self._support), moments, strict=True):
+            view.T_camera_moment = T_camera_moment
+
     def state(self) -> tuple[Any, ...]:
         """The map and the poses of the views; `go_on` takes it."""
         return self._map.state(), [view.T_map_camera for view in (*self._views, *self._support)]

@@ -39,6 +39,7 @@ from duagc.pipeline.kernels import (
 )
 from duagc.pipeline.kernels.sparse_steps import EVERYTHING, LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import TrainingStep
+from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import smoothstep_decay
 
@@ -80,6 +81,25 @@ class MappingStats:
             total=sum(tile.total for tile in stats),
             loss_before=float(np.average([tile.loss_before for tile in stats], weights=keyframes)),
             loss_after=float(np.average([tile.loss_after for tile in stats], weights=keyframes)),
+        )
+
+    def message(self, keyframe: Keyframe, robot: str, total: int) -> MapUpdate:
+        """The message about a step of mapping.
+
+        Args:
+            keyframe: at which it was taken.
+            robot: name of the component.
+            total: Gaussians of the whole map afterwards.
+        """
+        return MapUpdate(
+            stamp_ns=keyframe.stamp_ns,
+            robot=robot,
+            keyframe_index=keyframe.keyframe_index,
+            inserted=self.inserted,
+            pruned=self.pruned,
+            total=total,
+            loss_before=self.loss_before,
+            loss_after=self.loss_after,
         )
 
 

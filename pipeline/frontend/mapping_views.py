@@ -37,6 +37,7 @@ class View:
         exposure: of the image; None = as the map.
         information: [6, 6] of the pose, by tracking (right tangent: translation m, rotation rad).
         T_map_begun: [4, 4], the pose before it was refined.
+        T_camera_moment: [k, 4, 4], as of `TrainingView`; None = the camera stands still.
         guests: rows of the Gaussians of other tiles that it may see; None = not looked for.
     """
 
@@ -55,6 +56,7 @@ class View:
     exposure: Exposure | None = None
     information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
     T_map_begun: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    T_camera_moment: NDArray[np.float64] | None = None
     guests: NDArray[np.int64] | None = None
 
     @classmethod
@@ -126,7 +128,8 @@ class View:
         """The images of a level as a training step takes them."""
         color, depth_m = self.images(level)
         certainty = self.certainty if level == 0 else self.half_certainty
-        return TrainingView(color, depth_m, self.T_map_camera, self.usable(level), certainty)
+        mask = self.usable(level)
+        return TrainingView(color, depth_m, self.T_map_camera, mask, certainty, self.T_camera_moment)
 
     def usable(self, level: int) -> NDArray[np.bool_] | None:
         """The mask of a level; None = all pixels.

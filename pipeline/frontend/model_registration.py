@@ -16,12 +16,13 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import ModelConfig
 from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import pyramid_of
-from duagc.pipeline.frontend.tracked import TrackedFrame
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer
-from duagc.pipeline.recording import RgbdFrame
+from duagc.pipeline.recording import RgbdFrame, RgbdLog
 from duagc.pipeline.registration import Reference, RegistrationConfig, RgbdPyramid, register
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -80,6 +81,24 @@ class ModelTracker:
         if not found.ok:
             return tracked
         return replace(tracked, T_keyframe_camera=tracked.T_keyframe_camera @ found.T_reference_target)
+
+    def register_if_worth(
+        self, tracked: TrackedFrame, log: RgbdLog, T_map_keyframe: Array, views: frozenset[int]
+    ) -> TrackedFrame:
+        """Register a frame where that says more than tracking.
+
+        Args:
+            tracked: any frame of the log.
+            log: of the robot.
+            T_map_keyframe: [k, 4, 4], of all keyframes.
+            views: indices of the frames that made the map.
+        """
+        reasons = {Reason.NO_DEPTH} if self._depth == "ray_plane" else {Reason.NO_DEPTH, Reason.NONE}
+        made_it = tracked.frame_index in views
+        if tracked.status is Status.LOST or tracked.reason not in reasons or made_it:
+            return tracked
+        images = log.frame(tracked.frame_index)
+        return self.register(tracked, images, T_map_keyframe[tracked.keyframe_index])
 
     def _drawn(self, T_map_camera: Array) -> Reference:
         """What a camera at T_map_camera sees of the map."""

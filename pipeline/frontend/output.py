@@ -59,12 +59,14 @@ class BuiltMap:
         maps: before and after the final optimization.
         frames: of the log, those between keyframes registered to the map where that helped.
         T_map_keyframe: [k, 4, 4], poses of the keyframes, refined with the map.
+        shutter_s: how long the shutter is open, as the map was made; 0: images were taken for sharp.
     """
 
     updates: list[MapUpdate]
     maps: Maps
     frames: list[TrackedFrame]
     T_map_keyframe: Array
+    shutter_s: float = 0.0
 
 
 def keyframe_messages(

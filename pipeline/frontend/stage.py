@@ -16,7 +16,6 @@ import numpy as np
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base import progress as progress_bar
-from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
@@ -46,7 +45,7 @@ from duagc.pipeline.frontend.pose_optimization import OptimizedPath, PathOptimiz
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
-from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe, tracked_path
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.view_poses import moved_factors
 from duagc.pipeline.geometry.exposure import ExposureTrack
@@ -54,6 +53,7 @@ from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.recording import MotionPrior, RgbdLog, open_rgbd
 from duagc.pipeline.recording.moved_depth import DELAY_KEY
+from duagc.pipeline.recording.shutter import FOUND_KEY
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -233,16 +233,8 @@ def _trajectories(tracked: TrackedLog) -> list[Trajectory]:
     out = []
     for submap in tracked.submaps:
         frames = [f for f, n in zip(tracked.frames, tracked.submap_of, strict=True) if n == submap.number]
-        out.append(_trajectory(frames, np.array([k.T_map_keyframe for k in submap.keyframes])))
+        out.append(tracked_path(frames, np.array([k.T_map_keyframe for k in submap.keyframes])))
     return out
-
-
-def _trajectory(frames: Sequence[TrackedFrame], T_map_keyframe: Array) -> Trajectory:
-    """T_map_camera of the frames that have a pose."""
-    placed = [frame for frame in frames if frame.status is not Status.LOST]
-    poses = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in placed]
-    stamps = np.array([frame.stamp_ns for frame in placed], dtype=np.int64)
-    return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))
 
 
 def _images(log: RgbdLog) -> Images:
@@ -298,7 +290,7 @@ class _ComponentStage:
 
         optimized = save.done(part, optimize)  # the images that it kept are gone now
         solution, frames = optimized.solution, optimized.frames
-        log.move_depth(_trajectory(frames, solution.T_map_keyframe))
+        log.move_depth(tracked_path(frames, solution.T_map_keyframe))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
         part = f"{self.name}.exposures"
         estimation = ExposureEstimation(log.frame, log.camera, self.config.exposure, save, part)
@@ -322,6 +314,8 @@ class _ComponentStage:
         }
         if log.depth_delay_ns:
             notes[DELAY_KEY] = str(log.depth_delay_ns)
+        if built.shutter_s > 0:
+            notes[FOUND_KEY] = repr(built.shutter_s)
         odometry = [odometry_message(self.name, frame, refined.T_map_keyframe) for frame in built.frames]
         write_log(
             path,

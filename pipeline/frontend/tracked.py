@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
@@ -11,6 +12,7 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.registration import Level, Reference, Registration
 from duagc.pipeline.registration.features import Features
 
@@ -123,3 +125,16 @@ class TrackedKeyframe:
         """Median depth of what it sees, meters; infinite if it sees nothing."""
         known = self.coarsest.inverse_depth[self.coarsest.inverse_depth > 0]
         return 1 / float(np.median(known)) if len(known) else np.inf
+
+
+def tracked_path(frames: Sequence[TrackedFrame], T_map_keyframe: Array) -> Trajectory:
+    """T_map_camera of the frames that have a pose.
+
+    Args:
+        frames: of a log.
+        T_map_keyframe: [k, 4, 4], of the keyframes that they are anchored to.
+    """
+    placed = [frame for frame in frames if frame.status is not Status.LOST]
+    poses = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in placed]
+    stamps = np.array([frame.stamp_ns for frame in placed], dtype=np.int64)
+    return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))

@@ -41,6 +41,7 @@ from duagc.pipeline.messages import (
 )
 from duagc.pipeline.recording import LogWriter, open_rgbd, read_exposures, read_log
 from duagc.pipeline.recording.moved_depth import depth_delay_ns
+from duagc.pipeline.recording.shutter import found_shutter_s
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -265,8 +266,10 @@ def training_views(
     exposures = read_exposures(source.frontend, source.robot)
     with open_rgbd(source.log) as log:
         stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+        path = Trajectory(stamps, np.array([frame.T_map_camera for frame in frames]))
         log.delay_depth(depth_delay_ns(source.frontend))
-        log.move_depth(Trajectory(stamps, np.array([frame.T_map_camera for frame in frames])))
+        log.move_depth(path)
+        log.open_shutter(found_shutter_s(source.frontend), path)
         free = FreeSpace(log.camera, moving)
 
         def posed(k: int) -> PosedRgbd:
@@ -275,7 +278,8 @@ def training_views(
             if frames[k].frame_index in keyframes:
                 free.add(usable, T)
             exposure = exposures.at(frame.index)
-            return PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure)
+            moments = frame.T_camera_moment
+            return PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure, moments)
 
         views = ShelvedList(map(posed, (*first, *middles)))
     return ShelvedList(replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views)

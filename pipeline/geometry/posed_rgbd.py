@@ -21,6 +21,8 @@ class PosedRgbd:
         mask: bool [H, W], pixels that may be used; None: all.
         depth_sigma_m: float32 [H, W], standard deviation of the depth; None: not known pixel by pixel.
         exposure: of the image; None: as the map.
+        T_camera_moment: [k, 4, 4], k odd: where the camera is while its shutter is open, seen from the middle; None: it
+            stands still.
     """
 
     color: NDArray[np.uint8]
@@ -29,6 +31,7 @@ class PosedRgbd:
     mask: NDArray[np.bool_] | None = None
     depth_sigma_m: NDArray[np.float32] | None = None
     exposure: Exposure | None = None
+    T_camera_moment: NDArray[np.float64] | None = None
 
     @property
     def unit_color(self) -> NDArray[np.float32]:

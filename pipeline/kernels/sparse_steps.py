@@ -2,6 +2,8 @@
 
 Half of the 4x4 blocks of an image, in a checkerboard, tell nearly as much as all of them. And where hardly any light is
 left at a pixel, the Gaussians that share it say little; the one that takes the light below a limit stops it all.
+Views whose camera moves while its shutter is open are drawn as if it stood still at first, and by half of their blocks
+to the end: drawn from several places they take several times as long.
 """
 
 from __future__ import annotations
@@ -26,10 +28,12 @@ class LookedAt:
     Attributes:
         pixels: bool [H, W]; None: all.
         closing: of `Rasterizer.view_gradients`.
+        of_moving: bool [H, W], pixels of a view whose camera moves; None: it is looked at as if the camera stood still.
     """
 
     pixels: NDArray[np.bool_] | None = None
     closing: float = 0.0
+    of_moving: NDArray[np.bool_] | None = None
 
     def of(self, view: TrainingView) -> TrainingView:
         """A view with these pixels alone.
@@ -37,9 +41,15 @@ class LookedAt:
         Args:
             view: the whole.
         """
-        if self.pixels is None:
+        pixels = self.pixels
+        if view.T_camera_moment is not None:
+            if self.of_moving is None:
+                view = replace(view, T_camera_moment=None)
+            else:
+                pixels = self.of_moving
+        if pixels is None:
             return view
-        return replace(view, mask=self.pixels if view.mask is None else self.pixels & view.mask)
+        return replace(view, mask=pixels if view.mask is None else pixels & view.mask)
 
 
 EVERYTHING = LookedAt()
@@ -58,6 +68,7 @@ class SparseSteps:
         """
         self._config = config
         self._until = round(config.until * steps)
+        self._moving_from = config.moving_from * steps
         self._boards = checkerboards(camera.height, camera.width)
 
     def at(self, step: int, visit: int) -> LookedAt:
@@ -67,9 +78,11 @@ class SparseSteps:
             step: from 0.
             visit: number that differs by one from one look at a view to the next, which sees the other half.
         """
+        board = self._boards[visit % 2]
+        of_moving = board if step >= self._moving_from else None
         if step >= self._until:
-            return EVERYTHING
-        return LookedAt(self._boards[visit % 2] if self._config.checkerboard else None, self._config.closing)
+            return LookedAt(of_moving=of_moving)
+        return LookedAt(board if self._config.checkerboard else None, self._config.closing, of_moving)
 
 
 def checkerboards(height: int, width: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

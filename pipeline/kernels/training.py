@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels.adam import CompiledAdam
+from duagc.pipeline.kernels.moving_views import MovingViews
 from duagc.pipeline.kernels.rasterizer import Rasterizer
 from duagc.pipeline.kernels.types import Gradients, LossWeights, ViewLoss
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -34,6 +36,8 @@ class TrainingView:
         T_map_camera: [4, 4], pose of the camera in the frame of the Gaussians.
         mask: bool [H, W], pixels that count; None: all.
         depth_certainty: float32 [H, W], factor of the depth residuals (`splat.losses.depth_certainty`); None: 1.
+        T_camera_moment: [k, 4, 4], k odd: where the camera is while its shutter is open, seen from the middle; None: it
+            stands still.
     """
 
     color: Image
@@ -41,6 +45,7 @@ class TrainingView:
     T_map_camera: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
     depth_certainty: Image | None = None
+    T_camera_moment: NDArray[np.float64] | None = None
 
     @classmethod
     def of(cls, view: PosedRgbd, huber_m: float) -> TrainingView:
@@ -51,7 +56,9 @@ class TrainingView:
             huber_m: depth sigmas up to it change nothing.
         """
         certainty = None if view.depth_sigma_m is None else depth_certainty(view.depth_sigma_m, huber_m)
-        return cls(view.unit_color, view.depth_m, view.T_world_camera, view.mask, certainty)
+        return cls(
+            view.unit_color, view.depth_m, view.T_world_camera, view.mask, certainty, view.T_camera_moment
+        )
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,10 @@ class TrainingStep:
     rasterizer: Rasterizer
     loss: LossWeights
     depth_kind: DepthKind
+
+    @cached_property
+    def _moving(self) -> MovingViews:
+        return MovingViews(self.rasterizer)
 
     def loss_of(self, gaussians: Gaussians, camera: PinholeCamera, view: TrainingView) -> ViewLoss:
         """Loss of a view.
@@ -98,6 +109,21 @@ class TrainingStep:
             closing: as of `Rasterizer.view_gradients`.
             parameters: as of `Rasterizer.view_gradients`.
         """
+        if view.T_camera_moment is not None:
+            return self._moving.gradients(
+                gaussians,
+                camera,
+                view.T_map_camera,
+                view.T_camera_moment,
+                color=view.color,
+                depth_m=view.depth_m,
+                loss=self.loss,
+                mask=view.mask,
+                depth_certainty=view.depth_certainty,
+                depth_kind=self.depth_kind,
+                pose=pose,
+                parameters=parameters,
+            )
         return self.rasterizer.view_gradients(
             gaussians,
             camera,

@@ -14,6 +14,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.geometry import masks, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.open_shutter import OpenShutter
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.depth_sources import DepthImage, check_size, constant, depth_source
 from duagc.pipeline.recording.motion import MotionPrior, motion_prior
@@ -21,6 +22,7 @@ from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, mo
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile, Record
 from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, row_times_ns
+from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.schemas import topics as topic_table
 
 
@@ -34,7 +36,8 @@ class RgbdFrame:
     undistorted image, the robot itself), a moving object or otherwise to be ignored; None = all usable.
     depth_offset_ns: how much later the depth was taken. depth_moved: whether it was moved from there into the time of
     the color. depth_sigma: float32 [H, W], standard deviation of the depth in meters, 0 where there is no depth; None =
-    unknown.
+    unknown. T_camera_moment: after `open_shutter`, [k, 4, 4], k odd, where the camera is meanwhile, seen from the
+    middle; None = it stands still.
     """
 
     index: int
@@ -45,6 +48,7 @@ class RgbdFrame:
     depth_offset_ns: int = 0
     depth_sigma: NDArray[np.float32] | None = None
     depth_moved: bool = False
+    T_camera_moment: NDArray[np.float64] | None = None
 
     @property
     def usable_depth(self) -> NDArray[np.float32]:
@@ -61,7 +65,8 @@ class RgbdLog:
     to all of them.
 
     `robot`, `camera`, `depth_scale` (meters per unit), `valid` (bool [H, W], pixels that show the scene; None = all),
-    `depth_delay_ns` (of `delay_depth`), `readout` (how long images are read, as the log states it).
+    `depth_delay_ns` (of `delay_depth`), `readout` (how long images are read, as the log states it),
+    `stated_shutter_s` (how long the shutter is open, seconds, if it states that), `shutter` (of `open_shutter`).
     Reads what is asked for and keeps no more than a few frames.
     """
 
@@ -101,8 +106,11 @@ class RgbdLog:
         self._depth_at = self._log.entries_by_time(self._source.topic)
         self.pairing = pair(self._color_at, self._depth_at)
         self.depth_delay_ns = 0
-        self.readout = Readout.stated(dict(self._log.metadata()).get(LOG_RECORD, {}), str(self.path))
+        written = dict(self._log.metadata()).get(LOG_RECORD, {})
+        self.readout = Readout.stated(written, str(self.path))
+        self.stated_shutter_s = stated_shutter_s(written, str(self.path))
         self._motion: DepthMotion | None = None
+        self.shutter: OpenShutter | None = None
         if not len(self.pairing.offsets_ns):
             raise DuagError(
                 f"{self.path}: {self._color_topic} has {len(self._color_at)} images and {self._source.topic} "
@@ -201,15 +209,27 @@ class RgbdLog:
         if self.needs_motion:
             self._motion = DepthMotion(*parts)
 
-    def move_depth_by(self, frontend: Path) -> None:
-        """`delay_depth` and `move_depth` by what the front end found.
+    def open_shutter(self, shutter_s: float, *parts: Trajectory) -> None:
+        """Say how the camera moves while its shutter is open, in all frames read from now on.
 
         Args:
-            frontend: frontend.mcap of the robot; poses are read only if some depth or row is of another time.
+            shutter_s: how long it is open; 0: images are sharp.
+            parts: as of `move_depth`.
+        """
+        self.shutter = OpenShutter(shutter_s, DepthMotion(*parts)) if shutter_s > 0 else None
+
+    def move_depth_by(self, frontend: Path) -> None:
+        """`delay_depth`, `move_depth` and `open_shutter` by what the front end found.
+
+        Args:
+            frontend: frontend.mcap of the robot; poses are read only if they are needed.
         """
         self.delay_depth(depth_delay_ns(frontend))
-        if self.needs_motion:
-            self.move_depth(tracked_frames(frontend))
+        shutter_s = found_shutter_s(frontend)
+        if self.needs_motion or shutter_s > 0:
+            path = tracked_frames(frontend)
+            self.move_depth(path)
+            self.open_shutter(shutter_s, path)
 
     def motion_prior(self) -> MotionPrior | None:
         """How the camera moved by other sensors of the log; None if it has none."""
@@ -247,6 +267,9 @@ class RgbdLog:
             depth_offset_ns=self.frame_offset_ns(index),
             depth_sigma=None if found.sigma_m is None else self._of_scene(found.sigma_m),
             depth_moved=moved,
+            T_camera_moment=None
+            if self.shutter is None
+            else self.shutter.moments(stamp, found.depth_m, self.camera),
         )
 
     def _depth_of(self, color_ns: int, depth_ns: int | None) -> tuple[DepthImage, bool]:

@@ -107,6 +107,7 @@ RENDERING = {
     "views": ("Views", "rendered and compared with the image taken there"),
     "psnr_db": ("PSNR", "likeness of colors; higher is better"),
     "psnr_interpolated_db": ("PSNR, interpolated", "the same in the exposure interpolated from mapped frames"),
+    "psnr_moved_db": ("PSNR, as moved", "the same, drawn as the camera moved while its shutter was open"),
     "psnr_exposure_db": ("PSNR, exposure", "the same, each half of a view in the exposure fitted on the other half"),
     "psnr_exposure_left_db": ("left half", "of that, the left halves, in the exposure fitted on the right ones"),
     "psnr_exposure_right_db": ("right half", "of that, the right halves, in the exposure fitted on the left ones"),

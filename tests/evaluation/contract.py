@@ -16,6 +16,7 @@ ROBOT = {
 }  # fmt: skip
 VIEWS = {
     "views": int, "views_without_pose": int, "psnr_db": NUMBER, "psnr_interpolated_db": NUMBER,
+    "psnr_moved_db": NUMBER,
     "psnr_exposure_db": NUMBER, "psnr_exposure_left_db": NUMBER, "psnr_exposure_right_db": NUMBER,
     "ssim": NUMBER, "ms_ssim": NUMBER, "lpips": NUMBER, "st_lpips": NUMBER,
     "depth_l1_m": NUMBER, "depth_l1_exact_m": NUMBER,

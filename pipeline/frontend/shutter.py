@@ -1,0 +1,203 @@
+"""How long the shutter of a camera is open, by its images: the time for which they look most like the robot's map.
+
+A map is drawn from the places that a camera passes in that time, and compared with frames that did not make it. A map
+of blurred images is blurred itself, so that the best time is too short at first. So a copy of it is trained on its
+keyframes with the time found, which makes it sharper, and the search begins again, as long as the time grows.
+Frames of different speeds tell blur from a map that is merely coarse: what stands still looks the same at any time. No
+time is taken unless nearly all frames agree that it is better than none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol, SupportsIndex, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.geometry.open_shutter import LEAST_PX, OpenShutter, motion_px
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
+from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
+from duagc.pipeline.kernels.sparse_steps import LookedAt, checkerboards
+from duagc.pipeline.kernels.training import TrainingStep, TrainingView
+from duagc.pipeline.recording import RgbdLog
+from duagc.pipeline.recording.moved_depth import DepthMotion
+from duagc.pipeline.splat.gaussians import Gaussians
+
+FRAMES = 16
+"""Most frames that are compared, evenly spread; a gain of a few percent shows in so many."""
+KEYFRAMES = 24
+"""Most keyframes that a copy of the map is trained on, evenly spread."""
+FEWEST = 6
+"""Frames that move enough without which no time is found: the test has as many terms."""
+SIGMAS = 4.0
+"""Times its standard error that the mean gain must have; among ten times tried, chance brings that in one of 300 logs
+of 16 frames."""
+LEAST_GAIN = 0.01
+"""Of the color loss: less is not worth the time."""
+LONGEST_S = 0.25
+FACTOR = 1.25
+"""From one time that is tried to the next."""
+WORSE = 2
+"""Times in a row with a larger loss than the best, after which none is tried."""
+ROUNDS = 4
+STEPS = 48
+"""Of training in a round."""
+
+
+_Timed: TypeAlias = tuple[int, PosedRgbd]
+"""An image with the time of its stamp, ns."""
+
+
+class Frame(Protocol):
+    """A frame of the log.
+
+    Attributes:
+        frame_index: in it.
+        stamp_ns: its time.
+    """
+
+    @property
+    def frame_index(self) -> int: ...
+    @property
+    def stamp_ns(self) -> int: ...
+
+
+class ShutterSearch:
+    """Looks for the time that a robot's shutter is open."""
+
+    def __init__(
+        self,
+        log: RgbdLog,
+        config: MappingConfig,
+        path: Trajectory,
+        read: Callable[[int, Array], PosedRgbd],
+        *,
+        depth: DepthKind,
+        threads: SupportsIndex = 1,
+    ) -> None:
+        """Set up.
+
+        Args:
+            log: of the robot.
+            config: of its mapping.
+            path: T_map_camera of its frames.
+            read: gives the image of a frame, by its index and T_map_camera.
+            depth: of a Gaussian at a pixel.
+            threads: of the rasterizer; changes no bit.
+        """
+        self._stated_s, self._camera, self._depth = log.stated_shutter_s, log.camera, depth
+        self._config, self._read, self._threads = config, read, threads
+        self._motion = DepthMotion(path)
+        self._T_map_camera = dict(zip(path.stamps_ns.tolist(), path.poses, strict=True))
+        weights = LossWeights(**config.loss.of(depth).model_dump())
+        self._step = TrainingStep(Rasterizer(threads=threads), weights, depth)
+        self._huber_m = weights.depth_huber_m
+        self._boards = checkerboards(self._camera.height, self._camera.width)
+
+    def run(self, gaussians: Gaussians, compared: Sequence[Frame], trained: Sequence[Frame]) -> float:
+        """The time in seconds, as the log states it or the images tell; 0 where they do not show that they are blurred.
+
+        Where depth is exact, so is the surface of every Gaussian, and images are taken for sharp.
+
+        Args:
+            gaussians: the map as it has grown.
+            compared: frames that did not make it.
+            trained: its keyframes.
+        """
+        if self._depth == "ray_plane":
+            return 0.0
+        if self._stated_s is not None:
+            return self._stated_s
+        seen = self._images(compared, FRAMES)
+        found_s = self._best_s(gaussians, seen, 0.0)
+        if found_s == 0:
+            return 0.0
+        adam, keyframes = (
+            CompiledAdam(len(gaussians), threads=self._threads),
+            self._images(trained, KEYFRAMES),
+        )
+        for _ in range(ROUNDS):
+            gaussians = self._sharpened(gaussians, adam, keyframes, found_s)
+            longer_s = self._best_s(gaussians, seen, found_s)
+            if longer_s == found_s:
+                break
+            found_s = longer_s
+        return found_s
+
+    def _images(self, frames: Sequence[Frame], most: int) -> list[_Timed]:
+        """Images of some frames, evenly spread."""
+        chosen = [frames[k] for k in evenly_spaced(len(frames), min(most, len(frames)))]
+        return [(f.stamp_ns, self._read(f.frame_index, self._T_map_camera[f.stamp_ns])) for f in chosen]
+
+    def _best_s(self, gaussians: Gaussians, compared: Sequence[_Timed], from_s: float) -> float:
+        """The time, from one on, for which frames look most like a map; if it is the first, they must agree on it."""
+        shortest_s = from_s or self._shortest_s(compared)
+        sharp = [self._loss(gaussians, each, from_s)[0] for each in compared]
+        best_s, least, worse, time_s = from_s, sum(sharp), 0, shortest_s * (FACTOR if from_s else 1.0)
+        while time_s <= LONGEST_S and worse < WORSE:
+            found = [self._loss(gaussians, each, time_s) for each in compared]
+            total = sum(loss for loss, _ in found)
+            if total < least:
+                gains = [1 - loss / none for (loss, moves), none in zip(found, sharp, strict=True) if moves]
+                if from_s or _certain(gains):
+                    best_s, least, worse = time_s, total, -1
+            worse += 1
+            time_s *= FACTOR
+        return best_s
+
+    def _shortest_s(self, compared: Sequence[_Timed]) -> float:
+        """The time in which the median frame moves by as much as can be seen; infinite where nothing moves."""
+        moment_ns = 10_000_000
+        speeds = []
+        for stamp_ns, image in compared:
+            ends = self._motion.at(stamp_ns, stamp_ns + np.array([-moment_ns, moment_ns]))
+            if ends is not None:
+                speeds.append(motion_px(image.depth_m, self._camera, *ends) / (2e-9 * moment_ns))
+        if len(speeds) < FEWEST or (speed := float(np.median(speeds))) == 0:
+            return np.inf
+        return LEAST_PX / speed
+
+    def _loss(self, gaussians: Gaussians, timed: _Timed, shutter_s: float) -> tuple[float, bool]:
+        """Color loss of a frame with a time, and whether it moves visibly in it."""
+        view = self._view(timed, shutter_s, self._boards[0])
+        loss = self._step.loss_of(gaussians, self._camera, view)
+        return loss.color, view.T_camera_moment is not None
+
+    def _view(self, timed: _Timed, shutter_s: float, board: NDArray[np.bool_]) -> TrainingView:
+        stamp_ns, image = timed
+        moments = OpenShutter(shutter_s, self._motion).moments(stamp_ns, image.depth_m, self._camera)
+        view = TrainingView.of(replace(image, T_camera_moment=moments), self._huber_m)
+        return LookedAt(board, of_moving=board).of(view)
+
+    def _sharpened(
+        self, gaussians: Gaussians, adam: CompiledAdam, trained: Sequence[_Timed], shutter_s: float
+    ) -> Gaussians:
+        """The map after some training steps, each on a keyframe, in turn."""
+        floor = np.float32(np.log(self._config.seeding.thickness_m))
+        for step in range(STEPS):
+            turn, number = divmod(step, len(trained))
+            view = self._view(trained[number], shutter_s, self._boards[turn % 2])
+            gaussians, _ = self._step(
+                gaussians,
+                self._camera,
+                view,
+                adam=adam,
+                rates=self._config.rates,
+                least_log_scales=floor,
+            )
+        return gaussians
+
+
+def _certain(gains: Sequence[float]) -> bool:
+    """Whether frames agree that something is better: by the mean of their gains next to its standard error."""
+    if len(gains) < FEWEST:
+        return False
+    mean, error = np.mean(gains), np.std(gains, ddof=1) / np.sqrt(len(gains))
+    return bool(mean > LEAST_GAIN and mean > SIGMAS * error)
