@@ -3,8 +3,9 @@
 A map is drawn from the places that a camera passes in that time, and compared with frames that did not make it. A map
 of blurred images is blurred itself, so that the best time is too short at first. So a copy of it is trained on its
 keyframes with the time found, which makes it sharper, and the search begins again, as long as the time grows.
-Frames of different speeds tell blur from a map that is merely coarse: what stands still looks the same at any time. No
-time is taken unless nearly all frames agree that it is better than none.
+The mean of several renders is nearer to an image than one of them also where errors of the map merely cancel. So no
+time is taken unless frames agree that their own motions explain them better than those of other frames do: blur grows
+with speed, and such errors do not.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ KEYFRAMES = 24
 FEWEST = 6
 """Frames that move enough without which no time is found: the test has as many terms."""
 SIGMAS = 4.0
-"""Times its standard error that the mean gain must have; among ten times tried, chance brings that in one of 300 logs
-of 16 frames."""
-LEAST_GAIN = 0.01
-"""Of the color loss: less is not worth the time."""
+"""Times its standard error that the mean gain against motions of other frames must have: of sets of 16 frames that gain
+by chance, one in 1,800 has that."""
+LEAST_GAIN = 0.03
+"""Of the color loss, against sharp renders: less is not worth the time of training."""
 LONGEST_S = 0.25
 FACTOR = 1.25
 """From one time that is tried to the next."""
@@ -125,10 +126,9 @@ class ShutterSearch:
         )
         for _ in range(ROUNDS):
             gaussians = self._sharpened(gaussians, adam, keyframes, found_s)
-            longer_s = self._best_s(gaussians, seen, found_s)
-            if longer_s == found_s:
+            before_s, found_s = found_s, self._best_s(gaussians, seen, found_s)
+            if found_s <= before_s:
                 break
-            found_s = longer_s
         return found_s
 
     def _images(self, frames: Sequence[Frame], most: int) -> list[_Timed]:
@@ -137,20 +137,35 @@ class ShutterSearch:
         return [(f.stamp_ns, self._read(f.frame_index, self._T_map_camera[f.stamp_ns])) for f in chosen]
 
     def _best_s(self, gaussians: Gaussians, compared: Sequence[_Timed], from_s: float) -> float:
-        """The time, from one on, for which frames look most like a map; if it is the first, they must agree on it."""
-        shortest_s = from_s or self._shortest_s(compared)
-        sharp = [self._loss(gaussians, each, from_s)[0] for each in compared]
-        best_s, least, worse, time_s = from_s, sum(sharp), 0, shortest_s * (FACTOR if from_s else 1.0)
+        """The time for which frames look most like a map: about another one, or if that is 0 any that they agree on."""
+        shortest_s = from_s / FACTOR or self._shortest_s(compared)
+        sharp = [self._loss(gaussians, each, from_s) for each in compared]
+        best_s, least, time_s = from_s, sum(sharp), shortest_s
+        worse = -2 if from_s else 0  # the time below and the same one are tried besides
         while time_s <= LONGEST_S and worse < WORSE:
-            found = [self._loss(gaussians, each, time_s) for each in compared]
-            total = sum(loss for loss, _ in found)
-            if total < least:
-                gains = [1 - loss / none for (loss, moves), none in zip(found, sharp, strict=True) if moves]
-                if from_s or _certain(gains):
-                    best_s, least, worse = time_s, total, -1
+            total = sum(self._loss(gaussians, each, time_s) for each in compared)
             worse += 1
+            if total < least:
+                best_s, least, worse = time_s, total, 0
             time_s *= FACTOR
+        if best_s > from_s == 0.0 and not self._shows(gaussians, compared, best_s, sum(sharp)):
+            return 0.0
         return best_s
+
+    def _shows(
+        self, gaussians: Gaussians, compared: Sequence[_Timed], shutter_s: float, sharp: float
+    ) -> bool:
+        """Whether frames agree that they are blurred by their own motions, by the mean of their gains."""
+        gains, total, count = [], 0.0, len(compared)
+        for k, each in enumerate(compared):
+            own = self._loss(gaussians, each, shutter_s)
+            others = {(k + count * part // 4) % count for part in (1, 2, 3)} - {k}
+            exchanged = [self._loss(gaussians, each, shutter_s, moves_as=compared[o]) for o in sorted(others)]
+            total += own
+            gains.append(1 - own / float(np.mean(exchanged)))
+        if total > (1 - LEAST_GAIN) * sharp:
+            return False
+        return bool(np.mean(gains) > SIGMAS * np.std(gains, ddof=1) / np.sqrt(count))
 
     def _shortest_s(self, compared: Sequence[_Timed]) -> float:
         """The time in which the median frame moves by as much as can be seen; infinite where nothing moves."""
@@ -164,16 +179,20 @@ class ShutterSearch:
             return np.inf
         return LEAST_PX / speed
 
-    def _loss(self, gaussians: Gaussians, timed: _Timed, shutter_s: float) -> tuple[float, bool]:
-        """Color loss of a frame with a time, and whether it moves visibly in it."""
-        view = self._view(timed, shutter_s, self._boards[0])
-        loss = self._step.loss_of(gaussians, self._camera, view)
-        return loss.color, view.T_camera_moment is not None
+    def _loss(
+        self, gaussians: Gaussians, timed: _Timed, shutter_s: float, *, moves_as: _Timed | None = None
+    ) -> float:
+        """Color loss of a frame with a time, by its own motion or that of another frame."""
+        view = self._view(timed, shutter_s, self._boards[0], moves_as=moves_as)
+        return self._step.loss_of(gaussians, self._camera, view).color
 
-    def _view(self, timed: _Timed, shutter_s: float, board: NDArray[np.bool_]) -> TrainingView:
-        stamp_ns, image = timed
-        moments = OpenShutter(shutter_s, self._motion).moments(stamp_ns, image.depth_m, self._camera)
-        view = TrainingView.of(replace(image, T_camera_moment=moments), self._huber_m)
+    def _view(
+        self, timed: _Timed, shutter_s: float, board: NDArray[np.bool_], *, moves_as: _Timed | None = None
+    ) -> TrainingView:
+        stamp_ns, _ = moves_as or timed
+        shutter = OpenShutter(shutter_s, self._motion)
+        moments = shutter.moments(stamp_ns, timed[1].depth_m, self._camera)
+        view = TrainingView.of(replace(timed[1], T_camera_moment=moments), self._huber_m)
         return LookedAt(board, of_moving=board).of(view)
 
     def _sharpened(
@@ -193,11 +212,3 @@ class ShutterSearch:
                 least_log_scales=floor,
             )
         return gaussians
-
-
-def _certain(gains: Sequence[float]) -> bool:
-    """Whether frames agree that something is better: by the mean of their gains next to its standard error."""
-    if len(gains) < FEWEST:
-        return False
-    mean, error = np.mean(gains), np.std(gains, ddof=1) / np.sqrt(len(gains))
-    return bool(mean > LEAST_GAIN and mean > SIGMAS * error)

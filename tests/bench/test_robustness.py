@@ -39,6 +39,7 @@ def refuse(recording: Path, run: Path) -> None:
 def row(dial: str, ate_m: float, psnr_db: float, **more: object) -> dict:
     known = {"level": float(dial != bench.CLEAN), "value": "x", "frames": 100, "tracked_share": 1.0}
     known |= {"ate_m": ate_m, "ate_team_m": ate_m, "psnr_db": psnr_db, "psnr_exposure_db": psnr_db + 1}
+    known |= {"psnr_moved_db": psnr_db + 2}
     known |= {"robots": 2, "joined": 2, "components": 1, "submaps": 2, "lost": []}
     return {"dial": dial, **known, "worst_good_m": 0.01, "gap_sigma": 0.02} | more
 

@@ -1,5 +1,7 @@
 """PSNR with the exposure of a view fitted on one half and scored on the other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -120,3 +122,16 @@ def test_an_interpolated_exposure_changes_only_the_score_of_its_name() -> None:
     assert isinstance(known.psnr_interpolated_db, float)
     assert known.psnr_interpolated_db > 45
     assert known.ssim == plain.ssim
+
+
+def test_a_view_as_its_camera_moved_changes_only_the_score_of_its_name() -> None:
+    color = np.rint(texture() * 255)
+    image = np.rint(0.7 * color).astype(np.uint8)
+    exposure = Exposure(np.full(3, 0.7), np.zeros(3), np.ones(3))
+    wrong, depth, absent = drawn(np.zeros_like(color)), np.zeros(SHAPE, np.float32), Absent("none")
+    still = views.score_view(wrong, image, depth, absent, exposure=exposure)
+    moved = views.score_view(wrong, image, depth, absent, exposure=exposure, moved=drawn(color / 255))
+    assert still.psnr_moved_db == still.psnr_interpolated_db
+    assert isinstance(moved.psnr_moved_db, float)
+    assert moved.psnr_moved_db > 45
+    assert replace(moved, psnr_moved_db=still.psnr_moved_db) == still
