@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.frontend.mapping_views import View
 from duagc.pipeline.geometry.open_shutter import LEAST_PX, OpenShutter, motion_px
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
@@ -31,15 +32,19 @@ from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.recording.moved_depth import DepthMotion
 from duagc.pipeline.splat.gaussians import Gaussians
 
-FRAMES = 16
+FRAMES = 24
 """Most frames that are compared, evenly spread; a gain of a few percent shows in so many."""
+MAX_PIXELS = 160_000
+"""Of an image, or it is halved: so that a search takes a few percent of the time of mapping."""
+APART_PX = 3.0
+"""From one place to the next: a time is found by finer steps than a map is trained with."""
 KEYFRAMES = 24
 """Most keyframes that a copy of the map is trained on, evenly spread."""
 FEWEST = 6
 """Frames that move enough without which no time is found: the test has as many terms."""
-SIGMAS = 4.0
-"""Times its standard error that the mean gain against motions of other frames must have: of sets of 16 frames that gain
-by chance, one in 1,800 has that."""
+SIGMAS = 3.0
+"""Times its standard error that the mean gain against motions of other frames must have: of sets of 24 frames that gain
+by chance, one in 300 has that."""
 LEAST_GAIN = 0.03
 """Of the color loss, against sharp renders: less is not worth the time of training."""
 LONGEST_S = 0.25
@@ -52,7 +57,7 @@ STEPS = 48
 """Of training in a round."""
 
 
-_Timed: TypeAlias = tuple[int, PosedRgbd]
+_Timed: TypeAlias = tuple[int, TrainingView]
 """An image with the time of its stamp, ns."""
 
 
@@ -93,7 +98,9 @@ class ShutterSearch:
             depth: of a Gaussian at a pixel.
             threads: of the rasterizer; changes no bit.
         """
-        self._stated_s, self._camera, self._depth = log.stated_shutter_s, log.camera, depth
+        self._stated_s, self._depth = log.stated_shutter_s, depth
+        self._level = int(log.camera.width * log.camera.height > MAX_PIXELS)
+        self._camera = log.camera.halved() if self._level else log.camera
         self._config, self._read, self._threads = config, read, threads
         self._motion = DepthMotion(path)
         self._T_map_camera = dict(zip(path.stamps_ns.tolist(), path.poses, strict=True))
@@ -134,7 +141,21 @@ class ShutterSearch:
     def _images(self, frames: Sequence[Frame], most: int) -> list[_Timed]:
         """Images of some frames, evenly spread."""
         chosen = [frames[k] for k in evenly_spaced(len(frames), min(most, len(frames)))]
-        return [(f.stamp_ns, self._read(f.frame_index, self._T_map_camera[f.stamp_ns])) for f in chosen]
+        return [(f.stamp_ns, self._image(f)) for f in chosen]
+
+    def _image(self, frame: Frame) -> TrainingView:
+        image = self._read(frame.frame_index, self._T_map_camera[frame.stamp_ns])
+        view = View.of(
+            frame.frame_index,
+            image.color,
+            image.depth_m,
+            image.T_world_camera,
+            mask=image.mask,
+            depth_sigma_m=image.depth_sigma_m,
+            huber_m=self._huber_m,
+            exposure=image.exposure,
+        )
+        return view.training(self._level)
 
     def _best_s(self, gaussians: Gaussians, compared: Sequence[_Timed], from_s: float) -> float:
         """The time for which frames look most like a map: about another one, or if that is 0 any that they agree on."""
@@ -190,10 +211,9 @@ class ShutterSearch:
         self, timed: _Timed, shutter_s: float, board: NDArray[np.bool_], *, moves_as: _Timed | None = None
     ) -> TrainingView:
         stamp_ns, _ = moves_as or timed
-        shutter = OpenShutter(shutter_s, self._motion)
-        moments = shutter.moments(stamp_ns, timed[1].depth_m, self._camera)
-        view = TrainingView.of(replace(timed[1], T_camera_moment=moments), self._huber_m)
-        return LookedAt(board, of_moving=board).of(view)
+        shutter, view = OpenShutter(shutter_s, self._motion), timed[1]
+        moments = shutter.moments(stamp_ns, view.depth_m, self._camera, apart_px=APART_PX)
+        return LookedAt(board, of_moving=board).of(replace(view, T_camera_moment=moments))
 
     def _sharpened(
         self, gaussians: Gaussians, adam: CompiledAdam, trained: Sequence[_Timed], shutter_s: float
