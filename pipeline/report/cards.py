@@ -30,7 +30,7 @@ def cards(metrics: dict[str, Any], reasons: dict[str, list[str]]) -> list[dict[s
         ("team.ate_rmse_m", *labels.TEAM["ate_rmse_m"]),
         ("team.ate_rmse_m_mean_of_robots", *labels.TEAM["ate_rmse_m_mean_of_robots"]),
         (f"{held_out}.psnr_db", "PSNR", meaning("held_out", "psnr_db", "views never mapped")),
-        *_in_exposure(held_out, metrics["rendering"][final]["held_out"], meaning),
+        *_other_psnrs(held_out, metrics["rendering"][final]["held_out"], meaning),
         (f"{peers}.psnr_db", "PSNR, peers' views", meaning("peers", "psnr_db", "where the others stood")),
         (
             f"{held_out}.depth_l1_common_m",
@@ -61,11 +61,16 @@ def cards(metrics: dict[str, Any], reasons: dict[str, list[str]]) -> list[dict[s
     return shown
 
 
-def _in_exposure(
+def _other_psnrs(
     path: str, scores: Mapping[str, Any], meaning: Callable[[str, str, str], str]
 ) -> list[tuple[str, str, str]]:
-    """The card of PSNR in the exposure of the view, where frames are not all exposed alike."""
-    name = "psnr_interpolated_db"
-    if scores[name] == scores["psnr_db"]:
-        return []
-    return [(f"{path}.{name}", "PSNR, in exposure", meaning("held_out", name, "in the exposure of the view"))]
+    """Cards of PSNR in the exposure of the view and as its camera moved, where frames are not alike in that."""
+    others = (
+        ("psnr_interpolated_db", "psnr_db", "PSNR, in exposure", "in the exposure of the view"),
+        ("psnr_moved_db", "psnr_interpolated_db", "PSNR, as moved", "drawn as the camera moved"),
+    )
+    return [
+        (f"{path}.{name}", label, meaning("held_out", name, what))
+        for name, plain, label, what in others
+        if name in scores and scores[name] != scores[plain]
+    ]

@@ -44,7 +44,19 @@ def test_psnr_in_the_exposure_of_a_view_has_a_card_where_exposures_differ(fake):
     for kind in ("own", "fused", "refined"):
         scores = metrics["rendering"][kind]["held_out"]
         scores["psnr_interpolated_db"] = None if scores["psnr_db"] is None else scores["psnr_db"] + 2.5
-    assert "PSNR, in exposure" in [card["label"] for card in cards(metrics, {})]
+        scores["psnr_moved_db"] = scores["psnr_interpolated_db"]
+    labels_of = [card["label"] for card in cards(metrics, {})]
+    assert "PSNR, in exposure" in labels_of
+    assert "PSNR, as moved" not in labels_of
+
+
+def test_psnr_as_the_camera_moved_has_a_card_where_the_shutter_is_known(fake):
+    metrics = json.loads((fake.run / "metrics.json").read_text())
+    assert "PSNR, as moved" not in [card["label"] for card in cards(metrics, {})]
+    for kind in ("own", "fused", "refined"):
+        scores = metrics["rendering"][kind]["held_out"]
+        scores["psnr_moved_db"] = None if scores["psnr_db"] is None else scores["psnr_db"] + 1.5
+    assert "PSNR, as moved" in [card["label"] for card in cards(metrics, {})]
 
 
 def test_the_page_shows_numbers_with_units_pictures_and_reasons(html):
