@@ -328,7 +328,7 @@ class MapBuilder:
             mask,
             frame.depth_sigma,
             self.exposures.at(frame_index),
-            frame.T_camera_moment,
+            T_camera_moment=frame.T_camera_moment,
         )
 
     def _moments(self, frame_index: int) -> Array | None:

@@ -278,8 +278,8 @@ def training_views(
             if frames[k].frame_index in keyframes:
                 free.add(usable, T)
             exposure = exposures.at(frame.index)
-            moments = frame.T_camera_moment
-            return PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure, moments)
+            found = PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure)
+            return replace(found, T_camera_moment=frame.T_camera_moment)
 
         views = ShelvedList(map(posed, (*first, *middles)))
     return ShelvedList(replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views)

@@ -29,7 +29,7 @@ Places 3 px apart bring 0.3 dB more where it moves by 8 px, and take a quarter l
 STRIDE_PX = 16  # between the pixels whose motion is computed
 
 
-class Motion(Protocol):
+class CameraMotion(Protocol):
     """Knows how a camera moved."""
 
     def at(self, color_ns: int, times_ns: NDArray[np.int64]) -> Array | None:
@@ -98,7 +98,7 @@ class OpenShutter:
     """
 
     shutter_s: float
-    motion: Motion
+    motion: CameraMotion
 
     def moments(
         self,
