@@ -22,12 +22,14 @@ from duagc.pipeline.cache.footprint import fitting, robot_bytes
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store
 from duagc.pipeline.chain import Chain, Prepared
+from duagc.pipeline.config.frontend import KeyframeConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
 
 MEASURED = 20  # results of front ends that memory is estimated from
+LONG_FRAMES = 100  # a shorter log is done before its time left matters
 Say = Callable[[str], None]
 
 
@@ -84,6 +86,25 @@ def carrier_of(
         place=place,
         begun=begun,
     )
+
+
+def with_keyframes(
+    sizes: Mapping[str, Mapping[str, int]], recording: Recording, rule: KeyframeConfig
+) -> dict[str, dict[str, int]]:
+    """Sizes of logs, with about how many keyframes those of `LONG_FRAMES` and more will have.
+
+    Args:
+        sizes: `frames`, and the rest of what is known, of every robot.
+        recording: of these robots.
+        rule: when a frame becomes a keyframe.
+    """
+    from duagc.pipeline.checks.check import expected_keyframes
+
+    counted = {robot: dict(size) for robot, size in sizes.items()}
+    for robot, size in counted.items():
+        if size["frames"] >= LONG_FRAMES:
+            size["keyframes"] = expected_keyframes(recording.log(robot), rule).expected
+    return counted
 
 
 def workers_that_fit(

@@ -128,7 +128,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "is a recording sound",
             "base config geometry registration",
             _LOGS,
-            "evaluation cache runs",
+            "frontend evaluation cache runs",
         ),
         _part(
             "bench",
@@ -172,7 +172,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         _part(
             "preparation",
             "robots in processes",
-            "base config runs recording cache steps watch chain run_plan",
+            "base config runs recording checks cache steps watch chain run_plan",
         ),
     ),
     (

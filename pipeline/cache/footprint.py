@@ -10,7 +10,8 @@ from duagc.pipeline.cache.store import StoredResults
 PROCESS_BYTES = 135e6
 PYRAMID_BYTES = 400  # for every pixel of an image: pyramids that are kept between passes
 VIEW_BYTES = 14  # for every pixel of a view that the map is made of
-SUPPORT_VIEWS, KEYFRAMES_OF_FRAMES = 40, 0.06  # of these views
+SUPPORT_VIEWS = 40  # of these views
+KEYFRAMES_OF_FRAMES = 0.06  # where their number is unknown: short logs of slow cameras
 MARGIN = 1.25
 SPARE = 0.1  # share of the free memory that is left alone
 
@@ -19,7 +20,7 @@ def robot_bytes(size: Mapping[str, int], measured: Iterable[StoredResults] = ())
     """Most memory that front end and information of a robot will hold.
 
     Args:
-        size: `frames`, and `pixels` of an image.
+        size: `frames`, and `pixels` of an image; `keyframes`, if they are known.
         measured: results of front ends on this machine; where they took more than is predicted, this one will too.
     """
     ratios = [
@@ -31,7 +32,8 @@ def robot_bytes(size: Mapping[str, int], measured: Iterable[StoredResults] = ())
 
 
 def _predicted(size: Mapping[str, int]) -> float:
-    views = min(size["frames"], SUPPORT_VIEWS) + KEYFRAMES_OF_FRAMES * size["frames"]
+    keyframes = size.get("keyframes", KEYFRAMES_OF_FRAMES * size["frames"])
+    views = min(size["frames"], SUPPORT_VIEWS) + keyframes
     return PROCESS_BYTES + size["pixels"] * (PYRAMID_BYTES + VIEW_BYTES * views)
 
 

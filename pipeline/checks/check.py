@@ -11,7 +11,9 @@ import numpy as np
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks import estimate, geometry, gyroscope, images, measured, scale, stamps
 from duagc.pipeline.checks.findings import Finding, Report, Severity, judged, lines
+from duagc.pipeline.checks.keyframe_count import KeyframeCount, count_keyframes
 from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
+from duagc.pipeline.config.frontend import KeyframeConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import MotionPrior, Recording, RgbdLog, log_metadata, open_rgbd
@@ -73,6 +75,21 @@ def check_registration(log: Path, config: ChecksConfig = _DEFAULT) -> list[Findi
     return list(judged(found, config.sure, config.likely))
 
 
+def expected_keyframes(log: Path, rule: KeyframeConfig, config: ChecksConfig = _DEFAULT) -> KeyframeCount:
+    """About how many keyframes a run will make; a second, before it begins.
+
+    Args:
+        log: of a robot.
+        rule: when a frame becomes a keyframe.
+        config: from how many places that is estimated.
+
+    Raises:
+        DuagError: the log is damaged.
+    """
+    with open_rgbd(log) as rgbd:
+        return count_keyframes(rgbd, config.keyframes, rule)
+
+
 def _unreadable(robot: str, error: DuagError, advice: str) -> Finding:
     found, _, expected = str(error).partition(", expected ")
     return Finding(Severity.ERROR, "log", robot, found, expected or "a sound log", advice)
@@ -110,6 +127,7 @@ def _check_robot(
         add(_check_scales(recording, log, moved, prior, config=config.motion))
         add(gyroscope.check_gyroscope(robot, moved, prior))
         add(geometry.check_edges(robot, geometry.edges_of(log, config.edges), config.edges))
+    keyframes = count_keyframes(log, config.keyframes, KeyframeConfig())
     residuals = [move.residual for move in moved if np.isfinite(move.residual)]
     report.robots[robot] = {
         "frames": len(log),
@@ -119,7 +137,9 @@ def _check_robot(
         "with_depth": round(sight.known, 4),
         "registered_pairs": f"{sum(move.T_first_second is not None for move in moved)} of {len(moved)}",
         "reprojection": round(float(np.median(residuals)), 5) if residuals else None,
-        "keyframes": estimate.keyframes(moved, len(log), log.pairing.pairs[-1][0] - log.pairing.pairs[0][0]),
+        "keyframes": keyframes.expected,
+        "keyframes_from": keyframes.low,
+        "keyframes_to": keyframes.high,
     }
 
 
@@ -186,9 +206,9 @@ def format_report(report: Report) -> str:
         depth = row["depth_m"]
         reach = f"depth {depth[0]:.2f} {depth[1]:.2f} {depth[2]:.2f} m (1, 50, 99 %)" if depth else "no depth"
         moved = "" if row["reprojection"] is None else f", reprojection {row['reprojection']:.2%}"
-        out.append(
-            f"{robot}: {row['frames']} frames, {reach} in {row['with_depth']:.0%} of the pixels{moved}"
-        )
+        keyframes = f"{row['keyframes_from']} to {row['keyframes_to']} keyframes"
+        seen = f"{reach} in {row['with_depth']:.0%} of the pixels{moved}"
+        out.append(f"{robot}: {row['frames']} frames, {keyframes}, {seen}")
     e = report.estimate
     unit, name = (60, "minutes") if e["seconds_to"] > 120 else (1, "seconds")
     span = f"{e['seconds_from'] / unit:.0f} to {e['seconds_to'] / unit:.0f} {name}"

@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
 from duagc.pipeline.cache import durations
 from duagc.pipeline.checks.findings import Finding, Severity
-from duagc.pipeline.checks.geometry import Move
-from duagc.pipeline.config.frontend import KeyframeConfig
 
-RANGE = (1 / 1.5, 1.5)  # of the expected time
+RANGE = 1.5  # times and part of the expected time, where the keyframes are known
+KEYFRAMES = ("keyframes_from", "keyframes_to")
 WORKERS = 2  # robots at a time, as `duagc run` has them by default, each with a processor to itself
 BYTES_PER_ROBOT = 50_000_000  # maps at their cap of Gaussians with information; report and Rerun file
 BYTES_PER_FRAME = 25_000
-
-
-def keyframes(moved: Sequence[Move], frames: int, duration_ns: int) -> int:
-    """About how many keyframes the front end makes: one whenever it has lost the share of a view that asks for one.
-
-    Args:
-        moved: registered pairs.
-        frames: of the log.
-        duration_ns: from the first frame to the last.
-    """
-    rates = [m.lost / (m.second_ns - m.first_ns) for m in moved if np.isfinite(m.lost)]
-    if not rates:
-        return frames  # nothing registers: it may try with every frame
-    lost = float(np.mean(rates)) * duration_ns
-    return min(frames, 1 + round(lost / (1 - KeyframeConfig().min_overlap)))
 
 
 def estimate(
@@ -42,10 +25,23 @@ def estimate(
     """Seconds (from, to) of a run on two idle processors and bytes on disk.
 
     Args:
-        robots: `frames`, `pixels` of an image, `keyframes` and `moved` of every robot.
+        robots: `frames`, `pixels` of an image, `keyframes` and `moved` of every robot; `keyframes_from` and
+            `keyframes_to`, unless they are known.
         ratios: what stages take on this machine, as a share of what is predicted, by their names.
     """
     rows = list(robots.values())
+    fewest, most = ([{**r, "keyframes": r.get(key, r["keyframes"])} for r in rows] for key in KEYFRAMES)
+    seconds = _seconds(rows, ratios)
+    shorter, longer = (
+        math.exp(math.hypot(math.log(RANGE), math.log(_seconds(other, ratios) / seconds)))
+        for other in (fewest, most)
+    )
+    size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
+    return {"seconds_from": seconds / shorter, "seconds_to": seconds * longer, "bytes": float(size)}
+
+
+def _seconds(rows: Sequence[Mapping[str, Any]], ratios: Mapping[str, float]) -> float:
+    """Expected time of a run."""
 
     def side_by_side_s(stage: str, seconds: Iterable[float]) -> float:
         return ratios.get(stage, 1.0) * durations.side_by_side_s((), list(seconds), WORKERS)
@@ -57,8 +53,7 @@ def estimate(
     if len(rows) > 1:
         seconds += durations.exchange_s(rows) + durations.evaluation_of_team_s(len(rows))
         seconds += side_by_side_s("fusion", map(durations.fusion_s, rows))
-    size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
-    return {"seconds_from": RANGE[0] * seconds, "seconds_to": RANGE[1] * seconds, "bytes": float(size)}
+    return seconds
 
 
 def check_disk(folder: Path, needed: float) -> Iterator[Finding]:

@@ -71,7 +71,6 @@ class Move:
         turned_rad: angle of the rotation.
         depth_m: median depth of the first frame.
         depth_offset_ns: the larger of the two times between color and depth.
-        lost: share of the view of the first frame that the second one has not.
     """
 
     first_ns: int
@@ -82,7 +81,6 @@ class Move:
     turned_rad: float = 0.0
     depth_m: float = 0.0
     depth_offset_ns: int = 0
-    lost: float = np.nan
 
     @property
     def speed_m_s(self) -> float:
@@ -123,13 +121,11 @@ def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> Move:
     if not result.ok:
         return Move(first.stamp_ns, second.stamp_ns, None)
     T, depth_m = result.T_reference_target, first.usable_depth
-    residual, lost = _moved(depth_m, second.usable_depth, T, camera)
     return Move(
         first.stamp_ns,
         second.stamp_ns,
         T,
-        residual=residual,
-        lost=lost,
+        residual=_moved(depth_m, second.usable_depth, T, camera),
         sigma_m=_length_sigma_m(result),
         turned_rad=float(se3.distance(np.eye(4), T)[1]),
         depth_m=float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0,
@@ -148,25 +144,15 @@ def _length_sigma_m(result: Registration) -> float:
     return float(np.sqrt(max(variance, 0.0)))
 
 
-def _moved(
-    first_m: Image, second_m: Image, T_first_second: Array, camera: PinholeCamera
-) -> tuple[float, float]:
-    """Median relative difference of depth moved into the second frame, and share of the view that is lost there.
-
-    That share is by how far the middle of the image moves, because depth often ends before the border does.
-    """
+def _moved(first_m: Image, second_m: Image, T_first_second: Array, camera: PinholeCamera) -> float:
+    """Median relative difference of depth moved into the second frame; NaN if it shows nothing of the first."""
     points = camera.back_project(first_m)[::4, ::4].reshape(-1, 3)
     points = points[points[:, 2] > 0]
     moved = se3.transform(se3.inverse(T_first_second), points)
     index, u, v = visible(camera, moved, near_m=0.0)
-    if not len(index):
-        return np.nan, 1.0
-    before = points[index, :2] / points[index, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    shift = np.abs(np.median(np.stack([u, v], axis=1) - before, axis=0)) / [camera.width, camera.height]
     expected, found = moved[index, 2], second_m[v, u]
     both = found > 0
-    residual = float(np.median(np.abs(found - expected)[both] / expected[both])) if both.any() else np.nan
-    return residual, float(min(max(shift.sum(), 1 - len(index) / len(points)), 1.0))
+    return float(np.median(np.abs(found - expected)[both] / expected[both])) if both.any() else np.nan
 
 
 def check_moves(robot: str, found: list[Move], config: MotionChecks) -> Iterator[Finding]:

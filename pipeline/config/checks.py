@@ -95,6 +95,17 @@ class EdgeChecks(Config):
     """Mean gradient under the edges, relative to that at their own place, from which on a shift fits better."""
 
 
+class KeyframeChecks(Config):
+    """Places of a log from which its number of keyframes is estimated."""
+
+    places: int = Field(default=24, ge=1)
+    """Most frames from which the next keyframe is looked for, spread over the log; four are read for each."""
+    frames_per_place: int = Field(default=8, ge=1)
+    """A short log has one such frame in so many."""
+    max_width: int = Field(default=160, ge=32)
+    """Pixels; wider images are halved until they are not."""
+
+
 class ChecksConfig(Config):
     """Settings of `duagc check`."""
 
@@ -108,3 +119,4 @@ class ChecksConfig(Config):
     camera: CameraChecks = CameraChecks()
     motion: MotionChecks = MotionChecks()
     edges: EdgeChecks = EdgeChecks()
+    keyframes: KeyframeChecks = KeyframeChecks()

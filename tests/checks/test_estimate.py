@@ -2,14 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from duagc.pipeline.cache.durations import evaluation_s, front_end_s, fusion_s
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store, StoredResults
-from duagc.pipeline.checks.estimate import estimate, keyframes
-from duagc.pipeline.checks.geometry import Move
+from duagc.pipeline.checks.estimate import estimate
 from duagc.pipeline.checks.measured import MachineSpeed, speed_of
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
@@ -42,16 +40,15 @@ def test_small_images_take_more_than_their_share_of_pixels() -> None:
     assert estimate({})["bytes"] == 0
 
 
-def moves(lost: list[float], every_ns: int = 100_000_000) -> list[Move]:
-    return [Move(k * every_ns, (k + 1) * every_ns, np.eye(4), lost=share) for k, share in enumerate(lost)]
-
-
-def test_keyframes_come_as_often_as_views_are_lost() -> None:
-    """A keyframe is made when a fifth of the view is lost."""
-    assert keyframes(moves([0.1] * 8), 100, 4_000_000_000) == 21
-    assert keyframes(moves([0.0] * 8), 100, 4_000_000_000) == 1
-    assert keyframes(moves([1.0] * 8), 100, 4_000_000_000) == 100  # no more than there are frames
-    assert keyframes([Move(0, 1, None)], 30, 10**9) == 30
+def test_keyframes_that_are_not_known_widen_the_range() -> None:
+    known = robots([(300, 640 * 480, 40)])
+    unknown = {"0": known["0"] | {"keyframes_from": 20, "keyframes_to": 80}}
+    exact, wide = estimate(known), estimate(unknown)
+    assert wide["seconds_to"] > 1.2 * exact["seconds_to"]
+    assert wide["seconds_from"] < exact["seconds_from"] / 1.1
+    for number in (20, 80):  # its own range may lie beyond, its middle not
+        found = estimate(robots([(300, 640 * 480, number)]))
+        assert wide["seconds_from"] < 1.5 * found["seconds_from"] < wide["seconds_to"]
 
 
 SIZE = {"frames": 200, "pixels": 640 * 480, "keyframes": 10}

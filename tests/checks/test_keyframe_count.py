@@ -1,0 +1,78 @@
+"""The number of keyframes is estimated from some places of a log, without tracking it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from duagc.pipeline.checks.check import expected_keyframes
+from duagc.pipeline.checks.keyframe_count import KeyframeCount, count_keyframes
+from duagc.pipeline.config.checks import KeyframeChecks
+from duagc.pipeline.config.frontend import KeyframeConfig
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import Recording, RgbdFrame
+
+CAMERA = PinholeCamera(160, 120, 160.0, 160.0, 79.5, 59.5)
+FRAMES, PLACES = 300, 12
+
+
+class Wall:
+    """A log of a camera that moves along a wall, 2 m away, by whole pixels.
+
+    The share of a view that is lost is the distance in pixels over the width: a keyframe comes every 33 pixels.
+    """
+
+    def __init__(self, pixels: list[int], dark: range = range(0)) -> None:
+        """Begin. pixels: of every frame, along the wall. dark: frames without depth."""
+        noise = np.random.default_rng(0).random((CAMERA.height, max(pixels) + CAMERA.width))
+        smooth = sum(size * cv2.GaussianBlur(noise, (0, 0), size) for size in (2, 8, 32))
+        smooth = cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX)
+        self._wall = np.repeat(smooth.astype(np.uint8)[..., None], 3, axis=2)
+        self.camera, self._pixels, self._dark, self.reads = CAMERA, pixels, dark, 0
+
+    def __len__(self) -> int:
+        return len(self._pixels)
+
+    def frame(self, index: int) -> RgbdFrame:
+        self.reads += 1
+        first = self._pixels[index]
+        depth = np.full((CAMERA.height, CAMERA.width), 0 if index in self._dark else 2, np.float32)
+        return RgbdFrame(index, index, self._wall[:, first : first + CAMERA.width].copy(), depth)
+
+    def count(self) -> KeyframeCount:
+        return count_keyframes(self, KeyframeChecks(places=PLACES), KeyframeConfig())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("speed", [1, 3, 12])
+def test_a_keyframe_comes_whenever_a_fifth_of_the_view_is_lost(speed: int) -> None:
+    log = Wall([speed * k for k in range(FRAMES)])
+    found, true = log.count(), 1 + (FRAMES - 1) / np.ceil(33 / speed)
+    assert found.expected == pytest.approx(true, rel=0.1)
+    assert found.low <= true <= found.high
+    assert log.reads <= 8 * PLACES
+
+
+def test_a_camera_that_stands_still_half_of_the_time_makes_half_as_many_less_certainly() -> None:
+    moving, half = (
+        Wall([3 * min(k, until) for k in range(FRAMES)]).count() for until in (FRAMES, FRAMES // 2)
+    )
+    assert half.low < 1 + FRAMES / 2 / 11 < half.high
+    assert (half.high - half.low) / half.expected > 2 * (moving.high - moving.low) / moving.expected
+
+
+def test_frames_without_depth_make_none_and_what_does_not_register_may_make_any() -> None:
+    every = range(FRAMES)
+    dark = Wall([3 * k for k in every], dark=range(FRAMES // 2, FRAMES)).count()
+    assert dark.low < 1 + FRAMES / 2 / 11 < dark.high
+    assert Wall([0] * 30, dark=range(30)).count() == KeyframeCount(1, 1, 1)
+    jumping = Wall([101 * (k % 7) for k in range(60)]).count()
+    assert jumping.low == 1
+    assert jumping.high == 60
+
+
+def test_of_a_recording(small_recording: Path) -> None:
+    found = expected_keyframes(Recording(small_recording).log("bravo"), KeyframeConfig())
+    assert found.low <= 2 <= found.high < 5  # as `run` makes
