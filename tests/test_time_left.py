@@ -133,7 +133,7 @@ def test_an_information_that_takes_long_counts_for_nothing_else() -> None:
         simulated.times.step(*step)
     assert simulated.times._front.of["robot0"].now == ("information", simulated.now)
     before = simulated.times.left_s()
-    simulated.now += 10 * durations.information_s(simulated.sizes["robot0"])
+    simulated.now += 10 * durations.information_s({**simulated.sizes["robot0"], "keyframes": 15})
     assert simulated.times.left_s() <= before
 
 

@@ -11,6 +11,7 @@ import heapq
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
+from duagc.pipeline.config.fusion import FinetuneConfig
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.mapping import MappingConfig
 
@@ -24,10 +25,14 @@ MAPPING_S = (0.0015, 0.086)
 """The same of a step of mapping, of which every keyframe takes some."""
 FINAL_S = (0.0032, 0.087)
 """The same of a step of the final optimization."""
+MAPPING_OF_TILES, FINAL_OF_TILES = 1.9, 1.7
+"""By how much longer a step takes in a map of many tiles, whose views see Gaussians of others (docs/lab, length)."""
 START_S = 2.0
 """Of a process."""
 INFORMATION_S, DEVIATION_S = 0.020, 0.10
 """Of a frame, and of one that shows how far Gaussians are from the surface, for every million pixels."""
+INFORMATION_OF_TILE_S = 0.003
+"""Of a keyframe, which draws the whole map, for every tile but one."""
 FUSION_S = 1.0
 """Of a robot that has peers."""
 FUSED_VIEW_S = (0.085, 1.00)
@@ -42,8 +47,8 @@ VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
 RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
 """Maps that are drawn at a held-out view, at a keyframe, and at a view of a peer."""
-EXCHANGE_S = (2.4, 10.0)
-"""Of a robot that has peers: in any case, and for every million pixels."""
+EXCHANGE_S, EXCHANGED_KEYFRAME_S = (2.0, 10.0), 0.035
+"""Of a robot that has peers: in any case, and for every million pixels; and of each of its keyframes."""
 REPORT_S, VIEW_S = 5.0, 2.0
 """Of the whole run."""
 SERIAL = 0.15
@@ -67,8 +72,8 @@ def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
         "start": START_S,
         "tracking": of(TRACKING_S) * frames + (of(TRACKING_S) * frames + moved if moved else 0.0),
         "poses": of(POSES_S) * frames + moved,
-        "mapping": of(MAPPING_S) * mapping.iterations * keyframes,
-        "final": of(FINAL_S) * _final_steps(size, mapping),
+        "mapping": of(MAPPING_S) * mapping.iterations * keyframes * _longer(MAPPING_OF_TILES, size, mapping),
+        "final": of(FINAL_S) * _final_steps(size, mapping) * _longer(FINAL_OF_TILES, size, mapping),
         "model": of(MODEL_S) * frames + moved,
     }
 
@@ -90,7 +95,8 @@ def information_s(size: Size) -> float:
         size: of its log.
     """
     shown = min(size["frames"], InformationConfig().deviation_frames)
-    return size["pixels"] * 1e-6 * (INFORMATION_S * size["frames"] + DEVIATION_S * shown)
+    drawn_s = INFORMATION_OF_TILE_S * size["keyframes"] * (_tiles(size, MappingConfig()) - 1)
+    return size["pixels"] * 1e-6 * (INFORMATION_S * size["frames"] + DEVIATION_S * shown) + drawn_s
 
 
 def fusion_s(size: Size) -> float:
@@ -100,7 +106,8 @@ def fusion_s(size: Size) -> float:
         size: of its log.
     """
     view_s = _of_pixels(FUSED_VIEW_S, size) + _moved_s(size)
-    return FUSION_S + view_s * _trained_views(size, MappingConfig())
+    longer = _longer(FINAL_OF_TILES, size, MappingConfig())
+    return FUSION_S + view_s * _trained_views(size, FinetuneConfig()) * longer
 
 
 def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
@@ -147,7 +154,9 @@ def exchange_s(sizes: Sequence[Size]) -> float:
     Args:
         sizes: of the logs of its robots.
     """
-    return sum(_of_pixels(EXCHANGE_S, size) for size in sizes) if len(sizes) > 1 else 0.0
+    if len(sizes) < 2:
+        return 0.0
+    return sum(_of_pixels(EXCHANGE_S, size) + EXCHANGED_KEYFRAME_S * size["keyframes"] for size in sizes)
 
 
 def side_by_side_s(begun: Iterable[float], waiting: Sequence[float], workers: int) -> float:
@@ -187,19 +196,30 @@ def _moved_s(size: Size) -> float:
 
 def _final_steps(size: Size, mapping: MappingConfig) -> float:
     """Steps of the final optimization of all tiles of a map."""
-    whole = size["keyframes"] <= mapping.whole_keyframes
-    tiles = 1 if whole else math.ceil(size["keyframes"] / mapping.tile_keyframes)
+    tiles = _tiles(size, mapping)
     keyframes = size["keyframes"] / tiles
     views = (
         min(keyframes + mapping.support_views, size["frames"] / tiles)
-        + (not whole) * mapping.border_keyframes
+        + (tiles > 1) * mapping.border_keyframes
     )
     return tiles * mapping.final_steps(keyframes, views)
 
 
-def _trained_views(size: Size, mapping: MappingConfig) -> int:
-    """Keyframes and other frames that a map is trained on."""
-    return size["keyframes"] + min(mapping.support_views, max(size["frames"] - size["keyframes"], 0))
+def _tiles(size: Size, mapping: MappingConfig) -> int:
+    """Tiles of a map."""
+    whole = size["keyframes"] <= mapping.whole_keyframes
+    return 1 if whole else math.ceil(size["keyframes"] / mapping.tile_keyframes)
+
+
+def _longer(most: float, size: Size, mapping: MappingConfig) -> float:
+    """Time of a step in a map of some tiles relative to that in one of a single tile; `most` in one of many."""
+    return 1 + (most - 1) * (1 - 1 / _tiles(size, mapping))
+
+
+def _trained_views(size: Size, config: FinetuneConfig) -> int:
+    """Keyframes and other frames that a fused map is trained on."""
+    between = size["frames"] - size["keyframes"]
+    return size["keyframes"] + min(config.at_most(config.support_views, size["keyframes"]), max(between, 0))
 
 
 def slowdown(workers: int, processors: int) -> float:

@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from duagc.pipeline.cache.durations import evaluation_s, front_end_s, fusion_s
+from duagc.pipeline.cache.durations import evaluation_s, front_end_parts, front_end_s, fusion_s
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store, StoredResults
 from duagc.pipeline.checks.estimate import estimate
 from duagc.pipeline.checks.measured import MachineSpeed, speed_of
 from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs.declared_settings import DeclaredSettings
 from duagc.pipeline.runs.stages import EVALUATION, FRONTEND, FUSION, Stage
@@ -49,6 +51,17 @@ def test_keyframes_that_are_not_known_widen_the_range() -> None:
     for number in (20, 80):  # its own range may lie beyond, its middle not
         found = estimate(robots([(300, 640 * 480, number)]))
         assert wide["seconds_from"] < 1.5 * found["seconds_from"] < wide["seconds_to"]
+
+
+def test_maps_of_many_tiles_take_more_than_their_keyframes() -> None:
+    """Views of a tile see Gaussians of others: measured 1.3 with two tiles (docs/lab, keyframes-of-a-log)."""
+    one, two, many = ({"frames": 3000, "pixels": 160 * 120, "keyframes": n} for n in (64, 77, 480))
+    final = [front_end_parts(size, MappingConfig())["final"] for size in (one, two, many)]
+    steps = [MappingConfig().final_iterations * n for n in (64, 77, 480)]
+    a_step = np.array(final) / steps
+    assert a_step[1] / a_step[0] == pytest.approx(1.34, rel=0.1)
+    assert a_step[2] / a_step[0] == pytest.approx(1.6, rel=0.1)
+    assert fusion_s(many) > 480 / 64 * fusion_s(one)
 
 
 SIZE = {"frames": 200, "pixels": 640 * 480, "keyframes": 10}
