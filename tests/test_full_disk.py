@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,11 +15,27 @@ import pytest
 
 from duagc.pipeline import cli
 from duagc.pipeline.cache.store import Store
-from duagc.pipeline.runs.digest import digest_file
+from duagc.pipeline.runs.digest import digest, digest_file
 from duagc.pipeline.runs.stages import FUSION
+from tests.fixtures.commands import ROOT
 from tests.fixtures.small_run import SMALL
 
+RUN = "from duagc.pipeline.cli import main; main()"
 SETTINGS = [word for line in SMALL for word in ("--set", line)]
+DISK = "1m"  # a run of the small recording needs several
+ON_A_SMALL_DISK = """
+set -u
+mount -t tmpfs -o size="$1" none "$2" || exit 77
+shift
+where="$1"
+shift
+"$@"
+echo "exit code $?" >&2
+find "$where" -type f -printf '%P\\n'
+mount -o remount,size=200m "$where"
+"$@" 2>"$where/again.err" || exit 1
+cp -a "$where/run" "$where.run"
+"""
 
 
 @contextmanager
@@ -62,3 +80,29 @@ def test_fusion_that_finds_no_room_is_told_and_done_later(
     for name in ("robots/alpha/fused.ply", "robots/bravo/fused.mcap", "robots/bravo/fused.ply"):
         assert digest_file(out / name) == digest_file(small_run / name)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "store"]
+
+
+@pytest.mark.slow
+def test_a_run_on_a_disk_that_fills_goes_on_when_there_is_room(
+    small_run: Path, small_recording: Path, tmp_path: Path
+) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = [sys.executable, "-c", RUN, "run", str(small_recording), "--out", str(disk / "run"), *SETTINGS]
+    done = subprocess.run(
+        ["unshare", "-Urm", "sh", "-c", ON_A_SMALL_DISK, "sh", DISK, str(disk), *command],
+        cwd=ROOT,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if "unshare" in done.stderr or done.returncode == 77:
+        pytest.skip("no file system may be mounted here")
+    assert done.returncode == 0, done.stderr
+    *_, line, code = done.stderr.splitlines()
+    assert (code, "Traceback" in done.stderr) == ("exit code 1", False)
+    assert line.startswith("duagc: ")
+    left = done.stdout.split()
+    assert not [path for path in left if path.startswith("run/")]
+    assert digest(tmp_path / "disk.run") == digest(small_run)
