@@ -194,9 +194,7 @@ class Job:
             _, absent = self._looked_up(view, lambda name: view[name]())
             if absent and workers() > 1:
                 with self._processes().viewing(done, notes) as drawn:
-                    report = self._noted(
-                        chain.reader, stages.REPORT, done, of_report, lambda: workers() - 1
-                    )
+                    report = self._noted(chain.reader, stages.REPORT, done, of_report, lambda: workers() - 1)
                     return [report, drawn.result()]
         return [self._noted(chain.reader, stage, done, more, workers) for stage, more in wanted.items()]
 

@@ -98,6 +98,9 @@ class MappingConfig(Config):
     each with all Gaussians that it may see; before, tile by tile."""
     sparse: SparseStepsConfig = SparseStepsConfig()
     """Of the steps at a keyframe, and of the final optimization."""
+    shutter: Literal["stated", "estimated"] = "stated"
+    """How long the shutter is open, for views with motion blur where depth is not exact: as the log states it, else
+    not at all; or, where it states nothing, estimated from the images, which takes about a third longer."""
     stable_steps: int = 0
     """Steps after which a Gaussian is stable: frozen until the final optimization; 0: never."""
     depth: DepthKind | Literal["auto"] = "auto"

@@ -121,8 +121,8 @@ class ShutterSearch:
         """
         if self._depth == "ray_plane":
             return 0.0
-        if self._stated_s is not None:
-            return self._stated_s
+        if self._stated_s is not None or self._config.shutter == "stated":
+            return self._stated_s or 0.0
         seen = self._images(compared, FRAMES)
         found_s = self._best_s(gaussians, seen, 0.0)
         if found_s == 0:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import SparseStepsConfig
 from duagc.pipeline.frontend.shutter import ShutterSearch
 from duagc.pipeline.geometry import se3
@@ -46,7 +47,12 @@ def a_path() -> Trajectory:
     return Trajectory((1e9 * FRAME_S * k).astype(np.int64), poses)
 
 
-def found_s(shutter_s: float, error: float, stated_s: float | None = None) -> float:
+ESTIMATED = QUICK.model_copy(update={"shutter": "estimated"})
+
+
+def found_s(
+    shutter_s: float, error: float, stated_s: float | None = None, config: MappingConfig = ESTIMATED
+) -> float:
     """What is found of a log whose images were taken with a shutter, by a map whose colors have errors."""
     path, wall, rasterizer = a_path(), a_wall(), Rasterizer()
     motion = DepthMotion(path)
@@ -65,7 +71,7 @@ def found_s(shutter_s: float, error: float, stated_s: float | None = None) -> fl
     frames = [SimpleNamespace(frame_index=i, stamp_ns=int(s)) for i, s in enumerate(path.stamps_ns)]
     noise = np.random.default_rng(1).normal(scale=error, size=wall.colors.shape)
     grown = wall.replace(colors=(wall.colors + noise).astype(np.float32))
-    return ShutterSearch(log, QUICK, path, read, depth="blended").run(
+    return ShutterSearch(log, config, path, read, depth="blended").run(
         grown, [f for f in frames if f.frame_index % 3], frames[::3]
     )
 
@@ -77,7 +83,8 @@ def test_the_time_is_found_where_images_are_blurred_and_none_where_they_are_shar
 
 
 def test_what_the_log_states_counts() -> None:
-    assert found_s(0.0, 0.0, stated_s=0.012) == 0.012
+    assert found_s(0.0, 0.0, stated_s=0.012) == found_s(0.0, 0.0, stated_s=0.012, config=QUICK) == 0.012
+    assert found_s(SHUTTER_S, 0.0, config=QUICK) == 0.0
     assert stated_shutter_s({"exposure_s": "0.02"}, "a.mcap") == 0.02
     assert stated_shutter_s({}, "a.mcap") is None
     for text in ("-1", "long", "nan", "5"):
