@@ -31,6 +31,8 @@ class PlacesConfig(Config):
     """Keyframes asked for at once; what came of them decides about the next."""
     worth_nats: float = Field(default=1.0, ge=0.0)
     """Least information about the two robots that a sample must promise, in nats; 0: all that the budget allows."""
+    enough_closures: int = Field(default=10, ge=0)
+    """Verified loop closures with a neighbor from which on no more are looked for by the overlap of views."""
 
 
 class PeerRegistrationConfig(RegistrationConfig):

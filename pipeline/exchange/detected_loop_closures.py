@@ -251,8 +251,7 @@ class Verifier(LoopClosureProtocol):
         """Verify what is worth most now, and request what that needs; decide when nothing is worth it any more."""
         assert self.planner is not None
         while not self.waiting:
-            self._search_again()
-            chosen = self.planner.next()
+            chosen = self.planner.next() or self._found_again()
             if not chosen:
                 break
             for candidate in chosen:
@@ -271,15 +270,17 @@ class Verifier(LoopClosureProtocol):
                 self.tried.append(Tried(candidate, Verified(Verdict.UNLIKE, 0, 0, detail)))
         self._decide(send)
 
-    def _search_again(self) -> None:
-        """Look for further candidates near the loop closures that were verified, or near those that nearly were."""
+    def _found_again(self) -> list[Candidate]:
+        """Further candidates near the loop closures that were verified, or near those that nearly were."""
         assert self.planner is not None
         assert self.peer_keyframes is not None
         results = [t.result for t in self.tried]
-        near = [r.closure for r in results if r.closure] or [r.tentative for r in results if r.tentative]
-        if near:
-            predicted = self.database.overlaps(near, self.peer_keyframes)
-            self.planner.expect(predicted, self._score)
+        verified = [r.closure for r in results if r.closure]
+        near = verified or [r.tentative for r in results if r.tentative]
+        if not near or len(verified) >= self.config.places.enough_closures:
+            return []
+        self.planner.expect(self.database.overlaps(near, self.peer_keyframes), self._score)
+        return self.planner.next()
 
     def _score(self, own_keyframe: int, peer_keyframe: int) -> int:
         own, ratio = self.database.features[own_keyframe], self.config.places.ratio
