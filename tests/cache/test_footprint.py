@@ -11,7 +11,7 @@ SIZE = {"frames": 300, "pixels": 640 * 480}
 
 def front_end(peak_mb: float) -> StoredResults:
     key = StageKey("frontend", "alpha", {}, {}, {}, {"log": "a"})
-    return StoredResults(key, {}, {**SIZE, "keyframes": 9}, {"peak_rss_mb": peak_mb})
+    return StoredResults(key, {}, {**SIZE, "keyframes": 18}, {"peak_rss_mb": peak_mb})
 
 
 def test_no_more_robots_than_fit_and_at_least_one() -> None:
