@@ -190,8 +190,8 @@ class Job:
         wanted = {stage: more for stage, more in wanted.items() if self.plan.has(stage)}
         if len(wanted) > 1 and not self.carrier.looking:
             looking = Chain(self.recording, self._looking_carrier(), self.digests)
-            view = {stages.VIEW.name: partial(looking.reader, stages.VIEW, done, notes, workers)}
-            _, absent = self._looked_up(view, lambda name: view[name]())
+            view = partial(looking.reader, stages.VIEW, done, notes, workers)
+            _, absent = self._looked_up([stages.VIEW.name], lambda _: view())
             if absent and workers() > 1:
                 with self._processes().viewing(done, notes) as drawn:
                     report = self._noted(chain.reader, stages.REPORT, done, of_report, lambda: workers() - 1)

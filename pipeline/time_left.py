@@ -14,13 +14,12 @@ from duagc.pipeline.base.machine import processors
 from duagc.pipeline.base.worker_reports import OF_TEAM
 from duagc.pipeline.cache import durations
 from duagc.pipeline.cache.durations import Size
+from duagc.pipeline.cache.footprint import KEYFRAMES_OF_FRAMES
 from duagc.pipeline.cache.robots_work import LEAST_LEFT, START, TRUSTED_S, RobotsWork, RobotWork, kind_of
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.runs import stages
 
 EVERY_S = 10.0
-KEYFRAMES_OF_FRAMES = 0.06
-"""Until the keyframes of a robot are known."""
 UNHEARD = ("poses", "information", "surface", "agreement")
 """Parts of a front end, and of an evaluation, that do not say how far they are."""
 PARTS = {"tracking again": "tracking", "keyframes": "poses"}

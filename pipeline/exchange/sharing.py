@@ -75,7 +75,7 @@ class Sharing:
         self.current = CurrentPoses(self.own, len(self.team))
         self._body: NDArray[Any] | None = None
         self._records: NDArray[Any] | None = None
-        self._lies: NDArray[Any] | None = None
+        self._body_sent: NDArray[Any] | None = None
 
     # --- own evidence
 
@@ -102,12 +102,14 @@ class Sharing:
 
     def _sent_body(self) -> NDArray[Any]:
         """Own evidence as others get it."""
-        if self._lies is None:
+        if self._body_sent is None:
             records = injection.sent_evidence(
                 self.own_records(), self.config.injection, seed=self.seed, robot=self.data.robot
             )
-            self._lies = self.own_body() if records is None else evidence_wire.to_body(self.kind, records)
-        return self._lies[self._sent()]
+            self._body_sent = (
+                self.own_body() if records is None else evidence_wire.to_body(self.kind, records)
+            )
+        return self._body_sent[self._sent()]
 
     def _as_sent(self, poses: Anchors) -> Anchors:
         """Own poses as others get them."""

@@ -39,7 +39,6 @@ from duagc.pipeline.splat.information import unpack_geometry
 SCHEMA = 1
 RULES_FILE = Path(__file__).with_name("information_rules.toml")
 STRATA = ("opacity", "footprint_px", "views", "depth_m", "residual")
-Z_95 = 1.959963984540054
 
 
 class ShareRule(Config):
@@ -247,8 +246,8 @@ def _verdict(rule: ShareRule, columns: Mapping[str, Array]) -> dict[str, Any]:
     values = values[~np.isnan(values)]
     if not len(values):
         return _said(rule, "not testable", "there is nothing to compare", None)
-    share = float(np.mean((values >= rule.least) & (values <= rule.most)))
-    low, high = wilson(share, len(values))
+    met = int(np.count_nonzero((values >= rule.least) & (values <= rule.most)))
+    share, (low, high) = met / len(values), wilson(met, len(values))
     word = "holds" if low >= rule.share else "fails" if high < rule.share else "open"
     why = f"{100 * share:.1f} % ({100 * low:.1f} to {100 * high:.1f}) of {len(values)}"
     return _said(rule, word, f"{why}, expected {100 * rule.share:g} %", share)
@@ -259,17 +258,17 @@ def _said(rule: ShareRule, word: str, why: str, share: float | None) -> dict[str
     return {**named, "verdict": word, "why": why, "share": share}
 
 
-def wilson(share: float, count: int) -> tuple[float, float]:
+def wilson(met: int, count: int) -> tuple[float, float]:
     """95 % interval of a share that was found in a random sample (Wilson 1927).
 
     Args:
-        share: that was found.
+        met: of the sample, how many.
         count: of the sample.
     """
-    z2 = Z_95**2 / count
-    middle = (share + z2 / 2) / (1 + z2)
-    half = Z_95 / (1 + z2) * math.sqrt(share * (1 - share) / count + z2 / (4 * count))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    from scipy.stats import binomtest
+
+    interval = binomtest(met, count).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def code_digest() -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.training import DepthKind, LossConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -96,7 +97,14 @@ class MovingViews:
             depth_kind: depth of a Gaussian at a pixel.
             pose: also differentiate by the right tangent of T_map_camera.
             parameters: False: no derivative at all.
+        Raises:
+            DuagError: the loss has the term of surfaces.
         """
+        if loss.surface_weight:
+            raise DuagError(
+                f"loss.surface_weight: {loss.surface_weight:g}, expected 0 where a log states its shutter time "
+                "(exposure_s): single Gaussians have no depth along a motion"
+            )
         while len(self._rasterizers) < len(T_camera_moment):
             first = self._rasterizers[0]
             self._rasterizers.append(Rasterizer(first.isa, first.threads))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.training import SparseStepsConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.open_shutter import color_of, light_of, mean_color
@@ -91,3 +92,9 @@ def test_views_move_only_in_the_last_steps_and_by_halves() -> None:
     assert not (first.mask & second.mask).any()
     still = replace(view, T_camera_moment=None)
     assert steps.at(7, 0).of(still) is still
+
+
+def test_a_term_of_single_gaussians_is_refused() -> None:
+    training = TrainingStep(Rasterizer(), LossWeights(0.1, 1.0, 0.02, 0.04, surface_weight=0.5), "ray_plane")
+    with pytest.raises(DuagError, match=r"surface_weight: 0\.5, expected 0"):
+        training.loss_of(LARGE, SCENE.camera, a_view())
