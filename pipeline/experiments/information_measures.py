@@ -36,7 +36,6 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.experiments.information_blocks import PARAMETERS, BlockSums
-from duagc.pipeline.geometry import so3
 from duagc.pipeline.messages import GaussianInformation
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, pack_geometry
@@ -67,7 +66,7 @@ def measures(
         seed: of the random turns.
     """
     n = len(gaussians)
-    normal = _normals(gaussians)
+    normal = gaussians.normals()
     of_mm = np.ones(PARAMETERS)
     of_mm[OF_PARAMETERS["mean"]] = 1e-3
     unit = unit_diagonal(sums.parameters)
@@ -140,9 +139,14 @@ def unit_diagonal(F: Array) -> Array:
     Args:
         F: [n, d, d].
     """
-    d = np.diagonal(F, axis1=1, axis2=2)
-    scale = np.where(d > 0, 1 / np.sqrt(np.where(d > 0, d, 1.0)), 0.0)
+    scale = _conditional_sigma(F)
     return F * scale[:, :, None] * scale[:, None, :]
+
+
+def _conditional_sigma(F: Array) -> Array:
+    """Deviations [n, d] of single parameters if all others are known; zero where nothing is known."""
+    d = np.diagonal(F, axis1=1, axis2=2)
+    return np.where(d > 0, 1 / np.sqrt(np.where(d > 0, d, 1.0)), 0.0)
 
 
 def canonical_correlation(F: Array, a: slice, b: slice) -> Array:
@@ -169,9 +173,7 @@ def marginal_information(F: Array, block: slice) -> Array:
     inside[block] = True
     to_rest = F[:, inside][:, :, ~inside]
     rest = F[:, ~inside][:, :, ~inside]
-    d = np.diagonal(rest, axis1=1, axis2=2)
-    scale = np.where(d > 0, 1 / np.sqrt(np.where(d > 0, d, 1.0)), 0.0)
-    half = to_rest * scale[:, None, :] @ _root_inverse(unit_diagonal(rest))
+    half = to_rest * _conditional_sigma(rest)[:, None, :] @ _root_inverse(unit_diagonal(rest))
     return np.asarray(F[:, inside][:, :, inside] - half @ half.swapaxes(1, 2))
 
 
@@ -182,8 +184,7 @@ def generalized_eigenvalues(E: Array, F: Array) -> Array:
         E: [n, d, d], positive semidefinite.
         F: [n, d, d], likewise.
     """
-    d = np.diagonal(F, axis1=1, axis2=2)
-    scale = np.where(d > 0, 1 / np.sqrt(np.where(d > 0, d, 1.0)), 0.0)
+    scale = _conditional_sigma(F)
     values, vectors = np.linalg.eigh(unit_diagonal(F))
     out = np.full((len(F), 3), np.nan)
     for k in range(len(F)):
@@ -233,12 +234,6 @@ def _turned(U: Array, seed: int) -> Array:
     draws = random_streams.generator(seed, "turned information").normal(size=U.shape)
     Q, _ = np.linalg.qr(draws)
     return unit_diagonal(Q @ U @ Q.swapaxes(1, 2))
-
-
-def _normals(gaussians: Gaussians) -> Array:
-    """Axis [n, 3] of the smallest scale."""
-    axes = so3.from_quat_wxyz(gaussians.quats_wxyz.astype(np.float64))
-    return axes[np.arange(len(gaussians)), :, np.argmin(gaussians.log_scales, axis=1)]
 
 
 def _tangents(normals: Array) -> Array:

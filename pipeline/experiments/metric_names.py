@@ -66,15 +66,7 @@ KNOWN = tuple(_known())
 """Every name, as in `results.parquet`; `robots.*` is the mean over the robots."""
 
 _OF_SURFACE = ("calibration.*", "consensus.matching_*")
-_OF_TRUTH = (
-    "*.ate_*",
-    "*.rpe_*",
-    "*_of_truth",
-    "*.frames_with_truth",
-    "calibration.*",
-    "*.depth_l1_exact_m",
-    "consensus.matching_*",
-)
+_OF_TRUTH = (*_OF_SURFACE, "*.ate_*", "*.rpe_*", "*_of_truth", "*.frames_with_truth", "*.depth_l1_exact_m")
 
 
 def check_metric(name: str, where: str) -> None:
