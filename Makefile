@@ -4,6 +4,8 @@ PYTHON ?= python3
 TORCH_OPTIONS ?=
 # Options for pytest in `make test`, for example "--cpu 25": the 25 tests that take most processor time.
 TEST_OPTIONS ?=
+# Processes that run the tests; those of a folder stay together, so that they share what is made once.
+TEST_WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
@@ -43,7 +45,7 @@ demo: setup
 
 # A test that does not end is said, with what every thread was at, instead of being waited for.
 test: setup
-	$(BIN)/python -m pytest -m "not slow" -o faulthandler_timeout=300 -o faulthandler_exit_on_timeout=true $(TEST_OPTIONS)
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadgroup -o faulthandler_timeout=300 -o faulthandler_exit_on_timeout=true $(TEST_OPTIONS)
 
 # Four runs made again and compared, message by message, with what is stored under tests/golden.
 golden: setup
