@@ -162,12 +162,11 @@ class GrowingMap:
         keep[order[:count]] = False
         return self.keep(keep)
 
-    def prune_degenerate(self) -> int:
-        """Remove Gaussians that are transparent or huge, and no guests; how many there were."""
+    def prune_transparent(self) -> int:
+        """Remove Gaussians that are transparent, and no guests; how many there were."""
         config = self.config
         logit = np.log(config.min_opacity / (1 - config.min_opacity))
-        huge = self.gaussians.log_scales.max(axis=1, initial=-np.inf) > np.log(config.max_scale_m)
-        return self.keep((self.gaussians.opacity_logits >= logit) & ~huge | self.is_guest)
+        return self.keep((self.gaussians.opacity_logits >= logit) | self.is_guest)
 
     def seen_with(self, guests: Indices) -> Gaussians:
         """Some guests, and all own Gaussians after them.

@@ -26,7 +26,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
-from duagc.pipeline.kernels.training import TrainingStep, TrainingView, step_rows
+from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView, step_rows
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.map_cells import MapCells
 from duagc.pipeline.splat.optimizer import smoothstep_decay
@@ -118,7 +118,7 @@ class JointTraining:
             self._take_step(whole, cells, chosen, share=share, looked_at=looked_at)
             state = partial(self._state, cells, whole)
             checkpoints.at(part, step + 1, steps, state, shown=lambda: whole.gaussians)
-        return whole.prune_degenerate()
+        return whole.prune_transparent()
 
     def _begin(self, whole: GrowingMap, found: tuple[int, Any] | None) -> tuple[int, MapCells]:
         """The first step, and the cells of the map; goes on from what was found of a process before."""
@@ -164,5 +164,5 @@ class JointTraining:
     def _stepped(
         self, gradients: Gradients, gaussians: Gaussians, adam: CompiledAdam, *, rates: LearningRates
     ) -> Gaussians:
-        least = np.float32(np.log(self._config.seeding.thickness_m))
-        return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, least_log_scales=least)
+        limits = ScaleLimits.of(self._config)
+        return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, limits=limits)

@@ -38,7 +38,7 @@ from duagc.pipeline.kernels import (
     LossWeights,
 )
 from duagc.pipeline.kernels.sparse_steps import EVERYTHING, LookedAt, SparseSteps
-from duagc.pipeline.kernels.training import TrainingStep
+from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import smoothstep_decay
@@ -135,6 +135,7 @@ class Mapper(MapContent):
         self.seed, self._tile = seed, tile
         self.budget = MappingBudget(config, camera)
         self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())
+        self._limits = ScaleLimits.of(config)
         self._step = TrainingStep(self.rasterizer, self._loss_weights, self.depth)
 
     @property
@@ -214,7 +215,7 @@ class Mapper(MapContent):
             visits[other.index] += 1
             losses.append(self._optimize(other, level, self.config.rates, looked_at))
         before = losses[0] if losses else self._loss(view, level)  # the newest keyframe comes first
-        pruned += self._map.prune_degenerate()
+        pruned += self._map.prune_transparent()
         after = self._loss(view, level)
         return MappingStats(inserted, pruned, len(self._map), before, after)
 
@@ -315,7 +316,7 @@ class Mapper(MapContent):
             self._optimize(views[chosen], 0, rates, looked_at, pose_step=pose_step, keep_guests=True)
             state = partial(self._optimized, (before, inserted, pruned), poses)
             checkpoints.at(part, step + 1, steps, state, shown=lambda: self.gaussians)
-        pruned += self._map.prune_degenerate()
+        pruned += self._map.prune_transparent()
         return MappingStats(inserted, pruned, len(self._map), before, self._mean_loss())
 
     def _fixed_views(self, views: int) -> set[int]:
@@ -358,8 +359,7 @@ class Mapper(MapContent):
             pose=pose_step is not None,
             closing=looked_at.closing,
         )
-        least = np.float32(np.log(self.config.seeding.thickness_m))
-        take = partial(self._stepped, rates=rates, least_log_scales=least)
+        take = partial(self._stepped, rates=rates)
         if self._map.guests:
             self._map.step(self._guests(view), gradients, take, keep_guests=keep_guests)
         else:
@@ -376,8 +376,5 @@ class Mapper(MapContent):
         adam: CompiledAdam,
         *,
         rates: LearningRates,
-        least_log_scales: np.float32,
     ) -> Gaussians:
-        return self._step.stepped(
-            gaussians, gradients, adam=adam, rates=rates, least_log_scales=least_log_scales
-        )
+        return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, limits=self._limits)

@@ -27,7 +27,7 @@ from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, checkerboards
-from duagc.pipeline.kernels.training import TrainingStep, TrainingView
+from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.recording.moved_depth import DepthMotion
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -219,7 +219,7 @@ class ShutterSearch:
         self, gaussians: Gaussians, adam: CompiledAdam, trained: Sequence[_Timed], shutter_s: float
     ) -> Gaussians:
         """The map after some training steps, each on a keyframe, in turn."""
-        floor = np.float32(np.log(self._config.seeding.thickness_m))
+        limits = ScaleLimits.of(self._config)
         for step in range(STEPS):
             turn, number = divmod(step, len(trained))
             view = self._view(trained[number], shutter_s, self._boards[turn % 2])
@@ -229,6 +229,6 @@ class ShutterSearch:
                 view,
                 adam=adam,
                 rates=self._config.rates,
-                least_log_scales=floor,
+                limits=limits,
             )
         return gaussians

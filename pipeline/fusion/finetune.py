@@ -26,7 +26,7 @@ from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
-from duagc.pipeline.kernels.training import TrainingStep, TrainingView, step_rows
+from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView, step_rows
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.map_cells import MapCells
 from duagc.pipeline.splat.optimizer import TRAINED, smoothstep_decay
@@ -164,7 +164,7 @@ class _Training:
             looked_at.of(TrainingView.of(view, self._huber_m)),
             adam=adam,
             rates=rates,
-            least_log_scales=floor,
+            limits=ScaleLimits(floor),
             closing=looked_at.closing,
         )
         return stepped if trained is None else _where(trained, stepped, gaussians)

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import DepthKind, LearningRates
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -22,8 +23,31 @@ from duagc.pipeline.splat.losses import depth_certainty
 from duagc.pipeline.splat.optimizer import TRAINED
 
 Image = NDArray[np.float32]
+NO_LIMIT = np.float32(np.inf)
 LARGEST_LOGIT = 6.0
 """Opacity logits stay within +- this: gradients vanish beyond."""
+
+
+@dataclass(frozen=True)
+class ScaleLimits:
+    """Between which log-scales stay.
+
+    Attributes:
+        least: log of meters, one for all or [n, 3].
+        greatest: log of meters.
+    """
+
+    least: NDArray[np.float32] | np.float32
+    greatest: np.float32 = NO_LIMIT
+
+    @classmethod
+    def of(cls, config: MappingConfig) -> ScaleLimits:
+        """Those of a map that is grown.
+
+        Args:
+            config: of the mapping.
+        """
+        return cls(np.float32(np.log(config.seeding.thickness_m)), np.float32(np.log(config.max_scale_m)))
 
 
 @dataclass(frozen=True)
@@ -147,7 +171,7 @@ class TrainingStep:
         *,
         adam: CompiledAdam,
         rates: LearningRates,
-        least_log_scales: NDArray[np.float32] | np.float32,
+        limits: ScaleLimits,
         closing: float = 0.0,
     ) -> tuple[Gaussians, ViewLoss]:
         """The Gaussians after one step of Adam on one view, and the loss before it.
@@ -158,13 +182,11 @@ class TrainingStep:
             view: an image with its pose in the frame of the Gaussians.
             adam: state of the optimization; changed.
             rates: step lengths.
-            least_log_scales: log of meters, one for all or [n, 3]; no log-scale falls below.
+            limits: of the log-scales.
             closing: as of `Rasterizer.view_gradients`.
         """
         loss, gradients = self.gradients(gaussians, camera, view, closing=closing)
-        return self.stepped(
-            gaussians, gradients, adam=adam, rates=rates, least_log_scales=least_log_scales
-        ), loss
+        return self.stepped(gaussians, gradients, adam=adam, rates=rates, limits=limits), loss
 
     @staticmethod
     def stepped(
@@ -173,7 +195,7 @@ class TrainingStep:
         *,
         adam: CompiledAdam,
         rates: LearningRates,
-        least_log_scales: NDArray[np.float32] | np.float32,
+        limits: ScaleLimits,
     ) -> Gaussians:
         """The Gaussians after one step of Adam, within their limits.
 
@@ -182,13 +204,13 @@ class TrainingStep:
             gradients: of the loss by them.
             adam: state of the optimization; changed.
             rates: step lengths.
-            least_log_scales: log of meters, one for all or [n, 3]; no log-scale falls below.
+            limits: of the log-scales.
         """
         stepped = adam.step(gaussians, gradients, rates)
-        limit = np.float32(LARGEST_LOGIT)
+        logit = np.float32(LARGEST_LOGIT)
         return stepped.replace(
-            log_scales=np.maximum(stepped.log_scales, least_log_scales),
-            opacity_logits=np.clip(stepped.opacity_logits, -limit, limit),
+            log_scales=np.clip(stepped.log_scales, limits.least, limits.greatest),
+            opacity_logits=np.clip(stepped.opacity_logits, -logit, logit),
         )
 
 

@@ -90,7 +90,7 @@ def test_the_seed_matters_and_nothing_else_drew_from_it() -> None:
 
 
 def test_the_cap_holds_at_every_keyframe_and_ids_are_never_used_twice() -> None:
-    config = QUICK.model_copy(update={"max_gaussians": 400, "keyframe_share": 0.4})
+    config = QUICK.model_copy(update={"max_gaussians": 150, "keyframe_share": 0.4, "max_scale_m": 0.1})
     mapper = Mapper(CAMERA, config, seed=0)
     seen: set[int] = set()
     pruned = 0
@@ -98,7 +98,7 @@ def test_the_cap_holds_at_every_keyframe_and_ids_are_never_used_twice() -> None:
         before = set(mapper.gaussians.ids.tolist())
         stats = mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
         now = mapper.gaussians.ids
-        assert len(now) == stats.total <= 400
+        assert len(now) == stats.total <= 150
         assert (np.diff(now) > 0).all()
         new = set(now.tolist()) - before
         assert not new & seen
@@ -108,7 +108,7 @@ def test_the_cap_holds_at_every_keyframe_and_ids_are_never_used_twice() -> None:
         pruned += stats.pruned
     assert pruned > 0
     mapper.finalize()
-    assert len(mapper.gaussians) <= 400
+    assert len(mapper.gaussians) <= 150
 
 
 def test_a_view_that_is_explained_adds_little() -> None:
@@ -223,15 +223,15 @@ def test_what_was_seen_elsewhere_is_not_given_up_for_what_is_seen_now() -> None:
     turns = [se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.15 * k, 0.0])) for k in range(7)]
     covered = []
     for sweep in (2, 7):
-        crowded = {"max_gaussians": 100, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
-        crowded |= {"sparse": SparseStepsConfig(until=0.0)}
+        crowded = {"max_gaussians": 80, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
+        crowded |= {"max_scale_m": 0.2, "sparse": SparseStepsConfig(until=0.0)}
         mapper = Mapper(CAMERA, QUICK.model_copy(update=crowded), seed=0)
         stats = [mapper.add_keyframe(k, *shot(pose), pose) for k, pose in enumerate(turns)]
-        assert sum(s.pruned for s in stats) > 50
+        assert sum(s.pruned for s in stats) > 40
         covered.append(drawn(mapper, turns[0])[2])
     assert (
         covered[0] > covered[1] - 0.1
-    )  # 0.82 and 0.83 measured; far less if what the sweep did not see went first
+    )  # 0.89 and 0.94 measured; far less if what the sweep did not see went first
 
 
 def test_refinement_spends_what_is_free_where_images_are_drawn_worst() -> None:
@@ -334,3 +334,14 @@ def test_masked_pixels_neither_seed_nor_count() -> None:
     assert psnr_db > 20
     assert l1_m < 0.05
     assert completeness > 0.9
+
+
+def test_gaussians_stop_at_the_largest_scale_and_stay() -> None:
+    """A disc that is removed for its size at the end leaves those behind it too strong in color."""
+    config = QUICK.model_copy(update={"max_scale_m": 0.06, "min_opacity": 1e-6, "min_contribution": 0.0})
+    mapper, _ = build(config)
+    mapper.finalize()
+    largest = mapper.gaussians.log_scales.max(axis=1)
+    at_the_limit = largest == np.float32(np.log(0.06))
+    assert at_the_limit.any()
+    assert largest.max() <= np.float32(np.log(0.06))

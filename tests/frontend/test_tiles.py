@@ -12,7 +12,7 @@ from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_til
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
-from duagc.pipeline.kernels.training import TrainingStep, TrainingView
+from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from tests.frontend.test_mapping import CAMERA, POSES, QUICK, drawn, same, shot
 
@@ -153,10 +153,10 @@ def test_tiles_are_drawn_as_well_as_one_map_with_the_same_bits_whatever_the_thre
 
 @pytest.mark.parametrize("keep_guests", [True, False])
 def test_a_step_of_what_a_view_sees_is_that_of_all(keep_guests: bool) -> None:
-    config, step, least = (
+    config, step, limits = (
         QUICK,
         TrainingStep(Rasterizer(), LossWeights(0.1, 1.0, 0.02, 0.04), "blended"),
-        np.float32(-7.0),
+        ScaleLimits(np.float32(-7.0)),
     )
     maps = [take_tile(_grown(2), [1], _sights([1]), []) for _ in range(2)]
     view = TrainingView(shot(POSES[1])[0].astype(np.float32) / 255, shot(POSES[1])[1], POSES[1])
@@ -165,7 +165,7 @@ def test_a_step_of_what_a_view_sees_is_that_of_all(keep_guests: bool) -> None:
     assert 0 < len(seen) < count < len(part)
 
     def take(gradients: Gradients, gaussians: Gaussians, adam: CompiledAdam) -> Gaussians:
-        return step.stepped(gaussians, gradients, adam=adam, rates=config.rates, least_log_scales=least)
+        return step.stepped(gaussians, gradients, adam=adam, rates=config.rates, limits=limits)
 
     for _ in range(3):
         _, gradients = step.gradients(part.seen_with(seen), CAMERA, view)
