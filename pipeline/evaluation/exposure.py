@@ -27,6 +27,7 @@ ROUNDS = 5
 """Of reweighting."""
 HUBER_SIGMAS = 1.345
 """Residuals beyond count linearly (Huber 1964: 95 % of the efficiency of least squares)."""
+Image = NDArray[np.float32]
 PRIOR_SPREAD = 0.01
 """Standard deviation of the rendered colors (0..1) below which the gain stays nearer to one than to its fit."""
 CLIPPED = (1.5 / 255, 253.5 / 255)
@@ -99,7 +100,7 @@ def fitted_psnr(
     covered = counted & (render.alpha >= MIN_ALPHA)
     whole = bool(counted.all())
     halves = (slice(0, width // 2), slice(width // 2, width))
-    color, alpha = _planes(render.color), render.alpha.astype(np.float64)
+    color, alpha = _planes(render.color), render.alpha
     seen, errors = _planes(image), []
     for scored, other in (halves, halves[::-1]):
         squares = _squared_errors((color, alpha, seen), scored, other, covered=covered)
@@ -112,8 +113,8 @@ def fitted_psnr(
 
 
 def _squared_errors(
-    images: tuple[Array, Array, Array], scored: slice, fitted: slice, *, covered: NDArray[np.bool_]
-) -> Array | Absent:
+    images: tuple[Image, Image, Image], scored: slice, fitted: slice, *, covered: NDArray[np.bool_]
+) -> Image | Absent:
     """Squared errors [3, h, w'] of the scored columns in the exposure of the fitted columns.
 
     Args:
@@ -126,21 +127,21 @@ def _squared_errors(
     used = _thinned(covered[:, fitted])
     squares = np.empty_like(image[:, :, scored])
     for drawn, seen, error in zip(color, image, squares, strict=True):
-        found = fit_exposure(drawn[:, fitted][used], seen[:, fitted][used])
+        found = fit_exposure(*(plane[:, fitted][used].astype(np.float64) for plane in (drawn, seen)))
         if isinstance(found, Absent):
             return found
         gain, offset = found
-        np.multiply(drawn[:, scored], gain, out=error)
-        error += offset * alpha[:, scored]
+        np.multiply(drawn[:, scored], np.float32(gain), out=error)
+        error += np.float32(offset) * alpha[:, scored]
         np.clip(error, 0, 1, out=error)
         error -= seen[:, scored]
         error *= error
     return squares
 
 
-def _planes(colors: NDArray[np.floating]) -> Array:
+def _planes(colors: NDArray[np.floating]) -> Image:
     """Colors [h, w, 3] as [3, h, w]: arithmetic on every third number is slow."""
-    return np.ascontiguousarray(colors.transpose(2, 0, 1), dtype=np.float64)
+    return np.ascontiguousarray(colors.transpose(2, 0, 1), dtype=np.float32)
 
 
 def _thinned(used: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -151,6 +152,6 @@ def _thinned(used: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return used & grid
 
 
-def _psnr(squares: Array) -> float:
-    mse = float(np.mean(squares))
+def _psnr(squares: Image) -> float:
+    mse = float(np.mean(squares, dtype=np.float64))
     return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))

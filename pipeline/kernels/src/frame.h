@@ -164,7 +164,7 @@ struct Frame {
     Scratch<uint64_t> evaluated;             // per tile: vectors whose alpha was computed
     Scratch<Splat> tile_splats;              // per thread: the splats of one tile's list
     size_t longest_list = 0;
-    Scratch<float> front;                    // per thread: alpha and weight of one block's items
+    Scratch<float> front;                    // per thread: alpha and weight, or weight and depth, of one block's items
     Scratch<float> tile_rows;                // per thread: sums of the Gaussians of one tile's list
     Scratch<float> rows;                     // sums: of one Gaussian in one tile each, or in all of them
     bool one_row = false;                    // of a Gaussian, for all of its tiles: one thread adds them up in their order

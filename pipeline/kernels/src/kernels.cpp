@@ -126,6 +126,7 @@ static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
 }
 
 static void layer_depth(Frame& frame, float tolerance, float* depth) {
+    frame.front.need((frame.longest_list + ABREAST) * LANES * 2 * frame.threads);
     by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
         return over_tiles(frame, [&](int tile) {
