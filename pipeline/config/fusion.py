@@ -76,8 +76,8 @@ class FusionConfig(Config):
     peers', so that a robot estimates its own splat at its own place, or every member's alike, so that all robots end
     with one and the same Gaussian, as method and paper have it (see `docs/explanation/fusion.md`)."""
     spacing_per_sigma: float = Field(default=1.8, ge=0.0)
-    """Local spacing of splats, in units of their standard deviation along the surface: the mapper seeds discs with a
-    standard deviation of 0.55 cells."""
+    """Local spacing of splats, in units of their standard deviation along the surface: its median is 1.5 to 1.9 in
+    trained maps."""
     scatter_position_m: float = Field(default=0.01, gt=0.0)
     """Standard deviation by which two robots' splats of one place are expected to differ across the surface. It counts
     as much as `scatter_support` matched Gaussians, the rest is measured (association = neighbors)."""

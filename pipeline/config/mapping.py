@@ -30,7 +30,7 @@ class SeedingConfig(Config):
     """Share of the depth that is added to `depth_error_m`."""
     opacity: float = 0.7
     """Initial opacity."""
-    spread: float = 0.55
+    spread: float = 0.85
     """Standard deviation of a disc in units of its cell's side on the surface."""
     thickness_m: float = Field(default=THICKNESS_FLOOR_M, gt=0.0)
     """Standard deviation across the surface at first; also the floor of every log-scale while mapping. A log-scale at
@@ -69,9 +69,9 @@ class MappingConfig(Config):
     """Optimization steps (one view each) at a keyframe; every second one is on the newest keyframe."""
     iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""
-    final_iterations: int = 90
+    final_iterations: int = 76
     """Steps of the final optimization for every keyframe, at full size, shared by all views."""
-    final_iterations_view: int = 22
+    final_iterations_view: int = 19
     """The same for every view, keyframe or supporting frame; the larger number of steps counts."""
     final_iterations_max: int = 6000
     """Most steps of the final optimization of a tile."""

@@ -56,7 +56,7 @@ class MapLossConfig(Config):
 class SparseStepsConfig(Config):
     """What the steps of a training leave out until it nears its end."""
 
-    until: float = Field(default=0.75, ge=0.0, le=1.0)
+    until: float = Field(default=0.85, ge=0.0, le=1.0)
     """Share of the steps that leave something out; the others look at whole images, blended as they are drawn."""
     checkerboard: bool = True
     """Look at every second block of 4x4 pixels, and at the others when the view comes again."""
