@@ -10,7 +10,8 @@ STAMPS_NS = [0, 1_000_000_000, 5_000_000_000]
 
 
 def budget(**settings: object) -> MappingBudget:
-    return MappingBudget(MappingConfig.model_validate({"iterations": 10, **settings}), CAMERA)
+    steps = {"iterations": 10, "final_iterations": 90, "final_iterations_view": 22}
+    return MappingBudget(MappingConfig.model_validate(steps | settings), CAMERA)
 
 
 def test_without_a_budget_all_steps_are_taken() -> None:
