@@ -28,8 +28,7 @@ def image(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.repeat(np.rint(255 * np.clip(gray, 0, 1)).astype(np.uint8)[..., None], 3, axis=2), depth
 
 
-@pytest.fixture(scope="module")
-def gaussians() -> Gaussians:
+def room_map(seed: int) -> Gaussians:
     """The room from three places; the map frame is the keyframe's camera."""
     whole = SparseStepsConfig(
         until=0.0
@@ -37,11 +36,22 @@ def gaussians() -> Gaussians:
     config = MappingConfig(
         max_gaussians=20000, iterations=20, final_iterations=30, pose_rate=0.0, sparse=whole
     )
-    mapper = Mapper(CAMERA, config, seed=0, depth_noise_m=0.005)
+    mapper = Mapper(CAMERA, config, seed=seed, depth_noise_m=0.005)
     for k, T in enumerate((KEYFRAME, pose(x=-0.1, z=-0.9), pose(x=0.12, z=-0.85, yaw=0.05))):
         mapper.add_keyframe(k, *image(T), se3.inverse(KEYFRAME) @ T)
     mapper.finalize()
     return mapper.gaussians
+
+
+@pytest.fixture(scope="module")
+def maps() -> list[Gaussians]:
+    """Maps that differ by the order of their few steps: by which of them is taken, poses end twice as far off."""
+    return [room_map(seed) for seed in range(4)]
+
+
+@pytest.fixture(scope="module")
+def gaussians(maps: list[Gaussians]) -> Gaussians:
+    return maps[0]
 
 
 def tracked(sigma_m: float) -> TrackedFrame:
@@ -73,12 +83,12 @@ def tracker(gaussians: Gaussians, config: ModelConfig = CONFIG, threads: int = 1
     )
 
 
-def test_a_poor_pose_becomes_a_good_one(gaussians: Gaussians) -> None:
+def test_a_poor_pose_becomes_a_good_one(maps: list[Gaussians]) -> None:
     before = tracked(0.02)
-    after = tracker(gaussians).register(before, seen(), np.eye(4))
-    error = [se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME) for f in (before, after)]
-    assert error[1][0] < 0.5 * error[0][0]  # of a pixel of 6 mm
-    assert error[1][1] < 0.5 * error[0][1]
+    found = [tracker(gaussians).register(before, seen(), np.eye(4)) for gaussians in maps]
+    poor, *good = (np.array(se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME)) for f in (before, *found))
+    assert (np.mean(good, axis=0) < 0.6 * poor).all()  # a pixel is 6 mm wide
+    after = found[0]
     np.testing.assert_array_equal(after.information, before.information)
     assert (after.frame_index, after.status, after.keyframe_index) == (1, Status.OK, 0)
 
@@ -90,12 +100,12 @@ def test_a_pose_that_is_known_exactly_stays(gaussians: Gaussians) -> None:
     assert max(moved) < 1e-6
 
 
-def test_large_images_are_registered_at_a_smaller_size(gaussians: Gaussians) -> None:
+def test_large_images_are_registered_at_a_smaller_size(maps: list[Gaussians]) -> None:
     small = ModelConfig(max_pixels=CAMERA.width * CAMERA.height - 1)
     before = tracked(0.02)
-    after = tracker(gaussians, small).register(before, seen(), np.eye(4))
-    error = [se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME)[0] for f in (before, after)]
-    assert error[1] < 0.7 * error[0]
+    found = [tracker(gaussians, small).register(before, seen(), np.eye(4)) for gaussians in maps]
+    poor, *good = (se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME)[0] for f in (before, *found))
+    assert np.mean(good) < 0.8 * poor
 
 
 def test_a_frame_that_the_map_does_not_show_stays(gaussians: Gaussians) -> None:
