@@ -49,7 +49,7 @@ def result(recording: Path) -> dict:
     config = bench.changed(FrontendConfig(), MAPPING)
     with pytest.MonkeyPatch.context() as patch:  # the runs of other tests have processes of their own
         patch.setattr(bench, "worker_pool", lambda workers: nullcontext(ThisProcess()))
-        return bench.run(bench.Plan(recording, config, caps=(400, 3000), robots=("bravo",)))
+        return bench.run(bench.Plan(recording, config, caps=(1000, 3000), robots=("bravo",)))
 
 
 def test_every_run_is_there_and_measured(result: dict) -> None:
@@ -67,8 +67,8 @@ def test_every_run_is_there_and_measured(result: dict) -> None:
 
 def test_maps_are_scored_and_their_times_add_up(result: dict) -> None:
     maps = [row for row in result["rows"] if row["name"] == "map"]
-    assert [row["max_gaussians"] for row in maps] == [400, 3000]
-    assert 0 < maps[0]["gaussians"] <= 400 < maps[1]["gaussians"] <= 3000
+    assert [row["max_gaussians"] for row in maps] == [1000, 3000]
+    assert 0 < maps[0]["gaussians"] <= 1000 < maps[1]["gaussians"] <= 3000
     for row in maps:
         assert row["refined"]["views"] == row["unrefined"]["views"] == 2  # frames 4 and 12
         assert 10 < row["refined"]["psnr_db"] < 60
@@ -104,7 +104,7 @@ def test_tables_hold_every_row(result: dict) -> None:
     text = table_of(result)
     for name in (*bench.ABLATION, *bench.OPEN3D):
         assert text.count(f"| bravo | {name} |") >= 1
-    assert "| bravo | 400 |" in text
+    assert "| bravo | 1000 |" in text
     agreement = text.split("Agreement of held-out views")[1].split("Mapping")[0]
     assert agreement.count("| bravo |") == 2 + len(bench.ABLATION)  # Open3D has no held-out views
     assert "None" not in text
@@ -112,7 +112,7 @@ def test_tables_hold_every_row(result: dict) -> None:
 
 def test_the_curve_over_the_caps_is_drawn_from_the_rows(result: dict) -> None:
     robots = bench.by_cap(result | {"rows": result["rows"][::-1]})
-    assert [row["cap"] for row in robots["bravo"]] == [400, 3000]
+    assert [row["cap"] for row in robots["bravo"]] == [1000, 3000]
     assert robots["bravo"][1]["psnr_db"] == result["rows"][1]["refined"]["psnr_db"]
     drawn = figures.map_sizes(robots)
     assert drawn == figures.map_sizes(robots)
