@@ -77,6 +77,7 @@ class JointTraining:
         self._views, self._camera, self._config, self._seed = views, camera, config, seed
         weights = LossWeights(**config.loss.of(depth).model_dump())
         self._step = TrainingStep(Rasterizer(threads=threads), weights, depth)
+        self._limits = ScaleLimits.of(config)
         self._huber_m = weights.depth_huber_m
         self._refined = config.pose_rate > 0 and depth != "ray_plane"
         self._pose_steps = PoseSteps([view.information for view in views])
@@ -164,5 +165,4 @@ class JointTraining:
     def _stepped(
         self, gradients: Gradients, gaussians: Gaussians, adam: CompiledAdam, *, rates: LearningRates
     ) -> Gaussians:
-        limits = ScaleLimits.of(self._config)
-        return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, limits=limits)
+        return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, limits=self._limits)

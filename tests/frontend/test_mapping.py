@@ -223,15 +223,15 @@ def test_what_was_seen_elsewhere_is_not_given_up_for_what_is_seen_now() -> None:
     turns = [se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.15 * k, 0.0])) for k in range(7)]
     covered = []
     for sweep in (2, 7):
-        crowded = {"max_gaussians": 80, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
+        crowded = {"max_gaussians": 100, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
         crowded |= {"max_scale_m": 0.2, "sparse": SparseStepsConfig(until=0.0)}
         mapper = Mapper(CAMERA, QUICK.model_copy(update=crowded), seed=0)
         stats = [mapper.add_keyframe(k, *shot(pose), pose) for k, pose in enumerate(turns)]
-        assert sum(s.pruned for s in stats) > 40
+        assert sum(s.pruned for s in stats) > 50
         covered.append(drawn(mapper, turns[0])[2])
     assert (
         covered[0] > covered[1] - 0.1
-    )  # 0.89 and 0.94 measured; far less if what the sweep did not see went first
+    )  # 0.94 and 0.98 measured; far less if what the sweep did not see went first
 
 
 def test_refinement_spends_what_is_free_where_images_are_drawn_worst() -> None:

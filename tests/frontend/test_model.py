@@ -34,7 +34,7 @@ def room_map(seed: int) -> Gaussians:
         until=0.0
     )  # what is tested is the registration: the map is to be good in few steps
     config = MappingConfig(
-        max_gaussians=20000, iterations=20, final_iterations=30, pose_rate=0.0, sparse=whole
+        max_gaussians=20000, iterations=20, final_iterations=60, pose_rate=0.0, sparse=whole
     )
     mapper = Mapper(CAMERA, config, seed=seed, depth_noise_m=0.005)
     for k, T in enumerate((KEYFRAME, pose(x=-0.1, z=-0.9), pose(x=0.12, z=-0.85, yaw=0.05))):
@@ -87,7 +87,7 @@ def test_a_poor_pose_becomes_a_good_one(maps: list[Gaussians]) -> None:
     before = tracked(0.02)
     found = [tracker(gaussians).register(before, seen(), np.eye(4)) for gaussians in maps]
     poor, *good = (np.array(se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME)) for f in (before, *found))
-    assert (np.mean(good, axis=0) < 0.6 * poor).all()  # a pixel is 6 mm wide
+    assert (np.mean(good, axis=0) < 0.5 * poor).all()  # a pixel is 6 mm wide
     after = found[0]
     np.testing.assert_array_equal(after.information, before.information)
     assert (after.frame_index, after.status, after.keyframe_index) == (1, Status.OK, 0)
@@ -105,7 +105,7 @@ def test_large_images_are_registered_at_a_smaller_size(maps: list[Gaussians]) ->
     before = tracked(0.02)
     found = [tracker(gaussians, small).register(before, seen(), np.eye(4)) for gaussians in maps]
     poor, *good = (se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME)[0] for f in (before, *found))
-    assert np.mean(good) < 0.8 * poor
+    assert np.mean(good) < 0.7 * poor
 
 
 def test_a_frame_that_the_map_does_not_show_stays(gaussians: Gaussians) -> None:
