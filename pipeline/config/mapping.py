@@ -112,7 +112,7 @@ class MappingConfig(Config):
     seeding: SeedingConfig = SeedingConfig()
     min_opacity: float = 0.03
     """Gaussians below are pruned."""
-    max_scale_m: float = 0.25
+    max_scale_m: float = Field(default=0.25, gt=0.0)
     """Greatest standard deviation of a Gaussian: log-scales stop here."""
     sweep_keyframes: int = 6
     """Keyframes, the newest and those that see most of what it sees, in whose images the contributions of the Gaussians

@@ -17,6 +17,7 @@ from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
 from duagc.pipeline.splat.losses import Rendered
 
 Array = NDArray[np.float64]
+Image = NDArray[np.float32]
 MIN_ALPHA = 0.5
 """Opacity from which on a pixel of the render takes part in the fit."""
 MIN_PIXELS = 100
@@ -27,7 +28,6 @@ ROUNDS = 5
 """Of reweighting."""
 HUBER_SIGMAS = 1.345
 """Residuals beyond count linearly (Huber 1964: 95 % of the efficiency of least squares)."""
-Image = NDArray[np.float32]
 PRIOR_SPREAD = 0.01
 """Standard deviation of the rendered colors (0..1) below which the gain stays nearer to one than to its fit."""
 CLIPPED = (1.5 / 255, 253.5 / 255)
