@@ -94,7 +94,7 @@ class _Place:
         Args:
             step: gap that is tried first.
         """
-        if min(map(len, self._reference.levels)) < REGISTRATION.min_samples:
+        if len(self._reference.levels[0]) < REGISTRATION.min_samples:
             return math.inf
         while step:
             near = self._near[0]

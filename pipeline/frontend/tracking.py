@@ -171,8 +171,7 @@ class Tracker:
         """Make the first keyframe, unless the frame is held out or shows too little surface."""
         state, tracking = self.state, self.state.config.tracking
         reference = Reference.from_pyramid(frame.pyramid, tracking.strides)
-        used = reference.levels[: len(tracking.registration.iterations)]
-        too_little = any(len(level) < tracking.registration.min_samples for level in used)
+        too_little = len(reference.levels[0]) < tracking.registration.min_samples  # coarser ones are passed over
         if is_held_out(frame.frame_index) or too_little or not self._is_near(frame.depth_offset_ns):
             return self._mark_lost(frame, Reason.NO_DEPTH)
         insert_first_keyframe(state, frame, reference)

@@ -194,6 +194,22 @@ def test_color_alone_does_not_see_what_is_masked() -> None:
     assert se3.distance(found[0].T_reference_target, truth)[0] < 5e-3
 
 
+def test_a_small_image_that_is_mostly_masked_begins_a_map() -> None:
+    camera = CAMERA.scaled(80, 60)
+    usable = np.zeros((camera.height, camera.width), dtype=bool)
+    usable[:, : 2 * camera.width // 5] = True
+    tracker = Tracker(camera, CONFIG)
+    frames = []
+    for k in range(STEPS // 2):
+        image, depth_m = render(walk(k), camera=camera)
+        frames.append(tracker.track(k, 33_333_333 * k, image, depth_m, mask=usable))
+    reference = tracker.keyframes[0].reference
+    assert len(reference.levels[2]) < CONFIG.tracking.registration.min_samples < len(reference.levels[0])
+    assert all(frame.status is Status.OK for frame in frames)
+    truth = np.array([walk(k) for k in range(len(frames))])
+    assert ate_rmse_m(truth[:, :3, 3], positions(tracker, frames)) < 2e-3
+
+
 def test_depth_of_long_before_makes_no_keyframe() -> None:
     tracker = Tracker(CAMERA, CONFIG)
     far_ns = 50_000_000
