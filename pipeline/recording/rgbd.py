@@ -316,7 +316,7 @@ class RgbdLog:
             where = f"{self.path}: {record.topic} at {record.publish_time_ns} ns"
             raise DuagError(f"{where} has {len(data)} bytes that no decoder reads, expected JPEG or PNG")
         check_size(record, image.shape[1], image.shape[0], self.camera)
-        return np.ascontiguousarray(image[:, :, ::-1])
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def _mask_of(self, stamp_ns: int) -> NDArray[np.bool_] | None:
         entry = self._mask_at.get(stamp_ns)
