@@ -56,6 +56,13 @@ class VerificationConfig(GeometricVerificationConfig):
     """Settings of GICP."""
     hypotheses: int = Field(default=500, ge=1)
     """Three-point samples of RANSAC."""
+    certainty: Literal["measured", "alike"] = "measured"
+    """How certain a loop closure is: as its registration found; to compare with, all alike, with `alike_sigma_m` and
+    `alike_sigma_rad`."""
+    alike_sigma_m: float = Field(default=0.005, gt=0.0)
+    """Standard deviation of the translation of a loop closure where all are alike."""
+    alike_sigma_rad: float = Field(default=0.003, gt=0.0)
+    """The same for its rotation."""
     samples: int = Field(default=2000, ge=50)
     """Points with normal and intensity of the neighbor's keyframe used by the registration."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)

@@ -21,6 +21,9 @@ class FinetuneConfig(Config):
     """Steps on views of peers' maps for every step on an own view; 0: none, and only own Gaussians are trained."""
     peer_views: int = Field(default=40, ge=1)
     """Most views of peers' maps."""
+    peer_pixels: Literal["covered", "random", "certain", "uncertain"] = "covered"
+    """Pixels of these views that are trained on: all that the peer's map covers; to compare with, half of them, drawn
+    at random, or those whose depth its information states best, or worst."""
     support_views: int = Field(default=40, ge=0)
     """Most tracked frames between keyframes that take part."""
     rate: float = Field(default=0.25, gt=0.0)

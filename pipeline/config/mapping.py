@@ -32,9 +32,11 @@ class SeedingConfig(Config):
     """Initial opacity."""
     spread: float = 0.85
     """Standard deviation of a disc in units of its cell's side on the surface."""
+    shape: Literal["disc", "ball"] = "disc"
+    """What a Gaussian is at first: a disc on the surface; to compare with, a ball as wide as the disc."""
     thickness_m: float = Field(default=THICKNESS_FLOOR_M, gt=0.0)
-    """Standard deviation across the surface at first; also the floor of every log-scale while mapping. A log-scale at
-    the floor carries no information, and counts for nothing where maps are matched."""
+    """Standard deviation of a disc across the surface at first; also the floor of every log-scale while mapping. A
+    log-scale at the floor carries no information, and counts for nothing where maps are matched."""
     min_depth_m: float = 0.2
     """Nearer depth gets no Gaussian."""
     max_depth_m: float = 10.0
@@ -85,6 +87,9 @@ class MappingConfig(Config):
     pose_rate: float = Field(default=0.25, ge=0.0)
     """Largest step of the pose of a view in the final optimization, in standard deviations by tracking, where depth is
     not exact; it falls as the learning rates do. 0: poses stay where tracking and pose graph put them."""
+    support_choice: Literal["spread", "random", "information", "reversed"] = "spread"
+    """Which ones: evenly spread over the log; to compare with, drawn at random, or those by which the map, as it is
+    before the final optimization, would know most, or least, more of its Gaussians than by the keyframes."""
     support_seeds: bool = True
     """Whether supporting frames insert Gaussians where no keyframe saw anything."""
     densify_rounds: int = 4

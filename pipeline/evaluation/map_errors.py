@@ -10,11 +10,11 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.evaluation import uncertainty_calibration
 from duagc.pipeline.evaluation.groundtruth import Surface
-from duagc.pipeline.evaluation.pixel_deviation import sigma_along
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.messages import GaussianMap
 from duagc.pipeline.runs.folder import position_information
+from duagc.pipeline.splat.information import sigma_along
 
 MIN_GAUSSIANS = 100
 NAMES = (

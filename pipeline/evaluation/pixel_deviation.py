@@ -20,14 +20,13 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.messages import GaussianInformation, GaussianMap
 from duagc.pipeline.runs.folder import RobotRun, position_information
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import sigma_along
 
 if TYPE_CHECKING:
     from duagc.pipeline.geometry.camera import PinholeCamera
     from duagc.pipeline.geometry.masks import Mask
     from duagc.pipeline.kernels import Rasterizer
 
-WORST_CONDITION = 1e12
-"""Of the information of a position; a direction of one that is worse is not determined in float64."""
 LEAST_ACROSS = 0.1
 """Of a ray of depth one, along a normal: a disc seen more from the side, by 84 degrees, is no surface for the ray."""
 LEAST_STATED = 0.5
@@ -67,24 +66,6 @@ class RenderedDepth:
 
     depth_m: NDArray[np.float32]
     sigma_m: NDArray[np.float32]
-
-
-def sigma_along(information: Array, directions: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Standard deviation (m) [n] of positions along unit directions, and where it is determined; else infinite.
-
-    sigma^2 = n^T F^-1 n: everything but the position and all poses held fixed.
-
-    Args:
-        information: of the positions, 1/m^2 [n, 3, 3]; singular (condition above 1e12) is not determined.
-        directions: [n, 3], in the same frame.
-    """
-    sigma = np.full(len(information), np.inf)
-    values = np.linalg.eigvalsh(information) if len(information) else np.zeros((0, 3))
-    determined = (values[:, 0] > 0) & (values[:, 2] < WORST_CONDITION * values[:, 0])
-    some = directions[determined]
-    solved = np.linalg.solve(information[determined], some[..., None])[..., 0]
-    sigma[determined] = np.sqrt(np.sum(some * solved, axis=1))
-    return sigma, determined
 
 
 def stated_own(robot: RobotRun) -> StatedMap:

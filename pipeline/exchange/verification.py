@@ -10,6 +10,7 @@ from enum import Enum
 
 import numpy as np
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.exchange import VerificationConfig
 from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
@@ -99,7 +100,7 @@ def verify(
     verdict, detail = _VERDICTS[found.failure], _detail(found)
     closure = tentative = None
     if found.failure is None:
-        closure = LoopClosure(*candidate.ends, found.T_first_second, found.information)
+        closure = LoopClosure(*candidate.ends, found.T_first_second, _certainty(found.information, config))
     elif found.features.T_first_second is not None and found.features.accepted:
         tentative = LoopClosure(*candidate.ends, found.features.T_first_second, np.zeros((6, 6)))
     return Verified(verdict, found.features.matches, found.features.inliers, detail, closure, tentative)
@@ -135,11 +136,16 @@ def _verified_by_gicp(
         moved_m > config.max_refinement_m or moved_rad > config.max_refinement_rad
     ):
         return Verified(Verdict.MOVED, found.matches, found.inliers, detail)
-    closure = LoopClosure(
-        candidate.own_keyframe, candidate.peer_keyframe, result.T_target_source, result.information
-    )
+    closure = LoopClosure(*candidate.ends, result.T_target_source, _certainty(result.information, config))
     inliers = result.inliers if config.method == "gicp" else found.inliers
     return Verified(Verdict.KEPT, found.matches, inliers, detail, closure)
+
+
+def _certainty(information: Array, config: VerificationConfig) -> Array:
+    """Information [6, 6] that a loop closure counts with, of that which its registration found."""
+    if config.certainty == "measured":
+        return information
+    return np.diag(np.repeat([config.alike_sigma_m**-2, config.alike_sigma_rad**-2], 3))
 
 
 _VERDICTS = {

@@ -30,6 +30,7 @@ from duagc.pipeline.frontend.supporting_frames import supporting_frames
 from duagc.pipeline.frontend.tile_checkpoints import TileCheckpoints
 from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_tile
 from duagc.pipeline.frontend.tracked import TrackedFrame, tracked_path
+from duagc.pipeline.frontend.view_gain import ViewGain
 from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.exposure import ExposureTrack
@@ -102,7 +103,8 @@ class MapBuilder:
         del state  # or it would be in memory twice
         unrefined = self._whole.gaussians
         clock.lap("mapping_s")
-        supporting = supporting_frames(frames, keyframes, config, tiles=len(self._tiles))
+        gain = ViewGain(unrefined, self._depth, self.log.camera, config.mapping, self._seed, threads)
+        supporting = supporting_frames(frames, keyframes, config, gain, tiles=len(self._tiles))
         path = tracked_path(frames, np.array([k.T_map_camera for k in keyframes]))
         search = ShutterSearch(
             self.log, config.mapping, path, self._posed, depth=self._depth, threads=threads
@@ -137,8 +139,8 @@ class MapBuilder:
             self._free.add(depth_m, keyframe.T_map_camera)
             self._sights.append(ViewExtent.of(depth_m, self.log.camera))
         centers = [
-            se3.transform(k.T_map_camera, sight.center_camera[None])[0]
-            for k, sight in zip(keyframes, self._sights, strict=True)
+            se3.transform(k.T_map_camera, s.center_camera[None])[0]
+            for k, s in zip(keyframes, self._sights, strict=True)
         ]
         config, every = self.config.mapping, list(range(len(keyframes)))
         whole = len(every) <= config.whole_keyframes
@@ -313,7 +315,6 @@ class MapBuilder:
         self, frame_index: int, T_map_tracked: Array, information: Array, *, fixed: bool = False
     ) -> JointView:
         """A view, whose images are read when they are looked at; what moves is known by its pose before refinement."""
-
         read = partial(self._posed, frame_index, T_map_tracked)
         return JointView(frame_index, self._poses[frame_index], information, fixed, read)
 

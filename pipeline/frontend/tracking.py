@@ -171,7 +171,8 @@ class Tracker:
         """Make the first keyframe, unless the frame is held out or shows too little surface."""
         state, tracking = self.state, self.state.config.tracking
         reference = Reference.from_pyramid(frame.pyramid, tracking.strides)
-        too_little = len(reference.levels[0]) < tracking.registration.min_samples  # coarser ones are passed over
+        # a registration passes over coarser levels that show too little
+        too_little = len(reference.levels[0]) < tracking.registration.min_samples
         if is_held_out(frame.frame_index) or too_little or not self._is_near(frame.depth_offset_ns):
             return self._mark_lost(frame, Reason.NO_DEPTH)
         insert_first_keyframe(state, frame, reference)

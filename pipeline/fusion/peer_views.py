@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.training import DepthKind
@@ -21,7 +23,8 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.kernels import Rasterizer
-from duagc.pipeline.splat.information import gaussians_of
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import gaussians_of, sigma_along
 
 COVERED = 0.9
 """Opacity from which on a pixel of a peer's map counts as seen by it."""
@@ -38,7 +41,7 @@ def peer_views(
 ) -> Sequence[PosedRgbd]:
     """Color and depth of every peer's map at its keyframes and half way between them, as the own camera sees.
 
-    What a peer's map does not cover is masked.
+    What a peer's map does not cover is masked, and what `peer_pixels` leaves out.
 
     Args:
         evidence: of the peers, by name, in the world frame, each in its own colors.
@@ -66,17 +69,44 @@ def _views(
     colors: Mapping[str, ColorMap],
 ) -> Iterator[PosedRgbd]:
     rasterizer, drawn = Rasterizer(threads=context.threads), ""
-    for name, T_world_camera in chosen:
+    for number, (name, T_world_camera) in enumerate(chosen):
         if name != drawn:
             own_colors = colors[name].of(evidence[name])
             gaussians, drawn = gaussians_of(own_colors.ids, own_colors.anchors, own_colors.theta), name
+            sigma_m, _ = sigma_along(own_colors.position_information(), gaussians.normals())
         T_camera_world = se3.inverse(T_world_camera)
         render = rasterizer.forward(gaussians, context.camera, T_camera_world, depth_kind=depth_kinds[name])
         seen = render.alpha >= COVERED
+        if (kind := context.config.finetune.peer_pixels) == "random":
+            seen &= (
+                random_streams.generator(context.seed, "fusion.peer-pixels", view=number).random(seen.shape)
+                < 0.5
+            )
+        elif kind != "covered":
+            stated = _relative_sigma(gaussians, sigma_m, context, T_camera_world)
+            middle = np.median(stated[seen]) if seen.any() else 0.0
+            seen &= stated <= middle if kind == "certain" else stated > middle
         share = np.where(seen, render.alpha, np.float32(1))
         color = np.rint(np.clip(render.color / share[..., None], 0, 1) * 255).astype(np.uint8)
         depth_m = np.where(seen, render.depth / share, np.float32(0))
         yield PosedRgbd(color, depth_m, T_world_camera, seen)
+
+
+def _relative_sigma(
+    gaussians: Gaussians, sigma_m: Array, context: MapContext, T_camera_world: Array
+) -> NDArray[np.float32]:
+    """Stated deviation of what a pixel blends, over its depth [h, w]; infinite where nothing is stated.
+
+    sigma_m: [n], of every Gaussian across its disc; infinite where none is stated.
+    """
+    known = np.isfinite(sigma_m)
+    colors = np.stack([np.where(known, sigma_m, 0.0), known, known], axis=1)
+    rasterizer = Rasterizer(threads=context.threads)
+    drawn = rasterizer.forward(gaussians.replace(colors=colors), context.camera, T_camera_world)
+    weight, depth = drawn.color[..., 1], drawn.depth / np.maximum(drawn.alpha, np.float32(1e-6))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = np.where(weight > 0, drawn.color[..., 0] / weight / depth, np.float32(np.inf))
+    return np.asarray(sigma, dtype=np.float32)
 
 
 def _with_middles(T: Array) -> Array:

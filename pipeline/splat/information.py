@@ -46,6 +46,9 @@ INFORMATION_DIAGONAL = np.concatenate(
 )
 """Places of the diagonal [13] in information, in the order of theta."""
 
+WORST_CONDITION = 1e12
+"""Of the information of a position; a direction of one that is worse is not determined in float64."""
+
 
 def unpack_symmetric(upper: ArrayLike, size: int) -> Array:
     """Symmetric matrices [..., size, size] of their upper triangles, row by row."""
@@ -147,3 +150,21 @@ def gaussians_of(ids: NDArray[np.int64], anchors: NDArray[np.int32], theta: Arra
         colors=theta[:, COLOR].astype(np.float32),
         opacity_logits=theta[:, OPACITY].astype(np.float32),
     )
+
+
+def sigma_along(information: Array, directions: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Standard deviation (m) [n] of positions along unit directions, and where it is determined; else infinite.
+
+    sigma^2 = n^T F^-1 n: everything but the position and all poses held fixed.
+
+    Args:
+        information: of the positions, 1/m^2 [n, 3, 3]; singular (condition above 1e12) is not determined.
+        directions: [n, 3], in the same frame.
+    """
+    sigma = np.full(len(information), np.inf)
+    values = np.linalg.eigvalsh(information) if len(information) else np.zeros((0, 3))
+    determined = (values[:, 0] > 0) & (values[:, 2] < WORST_CONDITION * values[:, 0])
+    some = directions[determined]
+    solved = np.linalg.solve(information[determined], some[..., None])[..., 0]
+    sigma[determined] = np.sqrt(np.sum(some * solved, axis=1))
+    return sigma, determined

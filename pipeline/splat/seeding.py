@@ -137,8 +137,11 @@ def seed_discs(
     pitch = cells.side_px * cells.depth_m / np.sqrt(camera.fx * camera.fy)
     # a tilted surface is sampled more sparsely along its slope
     sigma = config.spread * np.stack([pitch, pitch / np.clip(cos_tilt, 0.4, 1.0)], axis=1)
-    thin = np.full((len(pitch), 1), config.thickness_m)
-    scales = np.maximum(np.concatenate([sigma, thin], axis=1), config.thickness_m)
+    if config.shape == "ball":
+        scales = np.repeat(sigma[:, :1], 3, axis=1)
+    else:
+        scales = np.concatenate([sigma, np.full((len(pitch), 1), config.thickness_m)], axis=1)
+    scales = np.maximum(scales, config.thickness_m)
     n = len(pitch)
     T = np.asarray(T_map_camera, dtype=np.float64)
     return Gaussians(

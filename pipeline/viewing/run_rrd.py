@@ -13,7 +13,6 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.files import new_file
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import Path3, paths
-from duagc.pipeline.evaluation.pixel_deviation import sigma_along
 from duagc.pipeline.evaluation.rendering import poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import so3
@@ -24,6 +23,7 @@ from duagc.pipeline.report.figures import color_of
 from duagc.pipeline.report.pictures import color_by
 from duagc.pipeline.runs.folder import RobotRun, RunFolder, position_information
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import sigma_along
 
 if TYPE_CHECKING:
     import rerun as rr

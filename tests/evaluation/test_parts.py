@@ -14,13 +14,13 @@ from duagc.pipeline.evaluation import rendering, views
 from duagc.pipeline.evaluation.groundtruth import Surface, surface
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import top_view_axes
-from duagc.pipeline.evaluation.pixel_deviation import sigma_along
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Render
 from duagc.pipeline.recording import LogWriter, Recording, open_rgbd
 from duagc.pipeline.runs.digest import digest_file
 from duagc.pipeline.runs.folder import RunFolder, position_information
+from duagc.pipeline.splat.information import sigma_along
 from duagc.schemas import topics
 from tests.fixtures.fake_run import make
 

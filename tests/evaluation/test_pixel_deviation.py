@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from duagc.pipeline.evaluation.pixel_deviation import StatedMap, rendered_depth, sigma_along
+from duagc.pipeline.evaluation.pixel_deviation import StatedMap, rendered_depth
 from duagc.pipeline.evaluation.pixel_errors import true_depth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.views import ScoredFrame
@@ -13,6 +13,7 @@ from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.recording import RgbdFrame
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import sigma_along
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 MIDDLE = (24, 32)

@@ -88,6 +88,18 @@ def test_a_closure_is_as_good_as_its_information_says(robots: dict) -> None:
     assert np.linalg.eigvalsh(result.closure.information)[0] > 1e4  # better than 1 cm and 10 mrad everywhere
 
 
+def test_loop_closures_can_all_be_as_certain(robots: dict) -> None:
+    (alpha, _), (bravo, _) = robots["alpha"], robots["bravo"]
+    sample = loop_closing_wire.read_sample(loop_closing_wire.write_sample(bravo.sample(0)), 3)
+    measured = verified(Candidate(2, 0, 0), alpha, sample).closure
+    config = VerificationConfig(certainty="alike", alike_sigma_m=0.01, alike_sigma_rad=0.02)
+    alike = verified(Candidate(2, 0, 0), alpha, sample, config).closure
+    assert measured is not None
+    assert alike is not None
+    np.testing.assert_array_equal(alike.T_own_peer, measured.T_own_peer)
+    np.testing.assert_allclose(alike.information, np.diag([1e4] * 3 + [2500.0] * 3))
+
+
 def test_a_darker_camera_finds_the_same_place(robots: dict) -> None:
     (alpha, truth_a), (bravo, truth_b) = robots["alpha"], robots["bravo"]
 

@@ -19,13 +19,16 @@ from duagc.pipeline.frontend.output import LATENCY_NS
 from duagc.pipeline.frontend.stage import depth_noise_m, run_frontend
 from duagc.pipeline.frontend.supporting_frames import supporting_frames
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.view_gain import ViewGain
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
+from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import content_digest, log_metadata, read_log
 from duagc.schemas import topics
 from tests.fixtures.moving_ball import RADIUS_M, with_ball
 from tests.fixtures.room import CAMERA, pose, render
+from tests.fixtures.speckled_wall import wall
 
 FRAMES = 13
 FRAME_NS = 33_333_333
@@ -197,13 +200,20 @@ def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> N
         )
         for k in range(FRAMES)
     ]
+    made = [
+        Keyframe(m.stamp_ns, "alpha", k, m.frame_index, np.eye(4), k - 1, np.eye(4), nothing, (1.0, 0.0))
+        for k, m in enumerate(keyframes)
+    ]
     forbidden = {4, 7, 12, *(m.frame_index for m in keyframes)}
+    gain = ViewGain(wall(), "blended", CAMERA, MappingConfig(), 0, 1)
     for count in (0, 3, 100):
-        config = TRACKING.model_copy(update={"mapping": MappingConfig(support_views=count)})
-        chosen = [f.frame_index for f in supporting_frames(frames, keyframes, config)]
-        assert chosen == sorted(set(chosen))
-        assert not forbidden & set(chosen)
-        assert len(chosen) == min(count, FRAMES - len(forbidden))
+        for choice in ("spread", "random", "information", "reversed"):
+            mapping = MappingConfig(support_views=count, support_choice=choice)
+            config = TRACKING.model_copy(update={"mapping": mapping})
+            chosen = [f.frame_index for f in supporting_frames(frames, made, config, gain)]
+            assert chosen == sorted(set(chosen))
+            assert not forbidden & set(chosen)
+            assert len(chosen) == min(count, FRAMES - len(forbidden))
 
 
 def test_a_missing_log_is_named(tmp_path: Path) -> None:

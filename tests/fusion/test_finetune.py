@@ -18,6 +18,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
+from duagc.pipeline.splat.information import INFORMATION_SIZE, MEAN_INFORMATION, pack_symmetric
 from duagc.pipeline.splat.map_cells import MapCells
 from tests.fixtures.speckled_wall import CAMERA, POSES, wall
 
@@ -158,11 +159,12 @@ def seen_by_zulu(
     most: int,
     depth_kind: DepthKind = "blended",
     threads: int = 1,
+    pixels: str = "covered",
 ) -> list[PosedRgbd]:
     return peer_views(
         {"zulu": evidence.in_world(T_world_keyframe)},
         {"zulu": T_world_keyframe},
-        context(FinetuneConfig(peer_views=most), threads=threads),
+        context(FinetuneConfig(peer_views=most, peer_pixels=pixels), threads=threads),
         depth_kinds={"zulu": depth_kind},
         colors=ALIKE,
     )
@@ -213,6 +215,29 @@ def test_a_neighbors_map_shows_what_it_would_from_where_the_neighbor_stood() -> 
     ]
     assert np.array_equal(some[0].color, all_of_them[1].color)
     assert not peer_views({}, {}, context(FinetuneConfig()), depth_kinds={}, colors={})
+
+
+def test_of_a_neighbors_views_the_half_of_which_its_information_is_better_can_be_taken() -> None:
+    true, poses = wall(), np.array(POSES[:1])
+    evidence = Evidence.from_map("zulu", true.replace(anchors=np.zeros(400, np.int32)), None, poses)
+    right = se3.transform(se3.inverse(poses[0]), true.means.astype(float))[:, 0] > 0
+    information = np.zeros((400, INFORMATION_SIZE))
+    information[:, MEAN_INFORMATION] = pack_symmetric(np.eye(3)) * np.where(right, 1e6, 1e4)[:, None]
+    evidence = replace(evidence, information=information)
+    masks = {}
+    for pixels in ("covered", "certain", "uncertain", "random"):
+        (view,) = seen_by_zulu(evidence, poses, 1, pixels=pixels)
+        masks[pixels] = view.mask
+    covered = masks["covered"]
+    assert np.array_equal(masks["certain"] | masks["uncertain"], covered)
+    assert not (masks["certain"] & masks["uncertain"]).any()
+    column = np.arange(CAMERA.width) > CAMERA.cx
+    for pixels, side in (("certain", column), ("uncertain", ~column)):
+        half = masks[pixels].sum() / covered.sum()
+        assert 0.4 < half < 0.6
+        assert masks[pixels][:, side].sum() > 0.8 * min(masks[pixels].sum(), covered[:, side].sum())
+    assert not (masks["random"] & ~covered).any()
+    assert 0.45 < masks["random"].sum() / covered.sum() < 0.55
 
 
 def test_neighbors_views_teach_what_own_ones_do_not_see(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:

@@ -1,5 +1,7 @@
 """Discs seeded from one image lie on what was measured and cover it once."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -28,7 +30,7 @@ def stripes() -> np.ndarray:
     return color
 
 
-def seeded(depth: np.ndarray, color: np.ndarray, budget: int = 10_000, **config: float) -> Gaussians:
+def seeded(depth: np.ndarray, color: np.ndarray, budget: int = 10_000, **config: Any) -> Gaussians:
     wanted = depth > 0
     return seed_discs(
         color,
@@ -53,6 +55,13 @@ def test_discs_lie_flat_on_a_plane(normal: tuple[float, float, float]) -> None:
     axes = so3.from_quat_wxyz(in_camera.quats_wxyz)
     np.testing.assert_allclose(np.abs(axes[:, :, 2] @ n), 1.0, atol=1e-6)
     np.testing.assert_allclose(np.exp(discs.log_scales[:, 2]), THICKNESS_FLOOR_M, rtol=1e-6)
+
+
+def test_a_ball_is_as_wide_as_the_disc_in_its_place_and_round() -> None:
+    depth = plane((0.6, 0.0, -1.0), 2.0)
+    discs, balls = seeded(depth, stripes()), seeded(depth, stripes(), shape="ball")
+    np.testing.assert_array_equal(balls.means, discs.means)
+    np.testing.assert_array_equal(balls.log_scales, np.repeat(discs.log_scales[:, :1], 3, axis=1))
 
 
 def test_detail_is_sampled_finely_and_plain_surfaces_coarsely() -> None:
