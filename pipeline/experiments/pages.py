@@ -15,6 +15,7 @@ from duagc.pipeline.base.random_streams import generator
 from duagc.pipeline.base.templates import filled
 from duagc.pipeline.experiments.carry_out import RESULT, check_rule, read_result
 from duagc.pipeline.experiments.costs import write_costs
+from duagc.pipeline.experiments.overview import counted, judged_uses, read_uses
 from duagc.pipeline.experiments.rule import RULES, Experiment, Metric, Rule, read_experiment
 from duagc.pipeline.experiments.statistics import bca_interval, mean
 from duagc.pipeline.experiments.verdicts import (
@@ -87,12 +88,31 @@ def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
         _write(out / one.experiment.name / FIGURE, section["figure"])
     codes = {one.result.get("code_sha256") for one in judged}
     package, mixed = "duagc.pipeline.experiments", len(codes) > 1 or None in codes
-    page = filled(package, "page.html.j2", title="Experiments", sections=sections, mixed=mixed)
-    _write(out / PAGE, page)
-    _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, sections=sections, mixed=mixed))
+    content: dict[str, Any] = {
+        "sections": sections,
+        "mixed": mixed,
+        "counts": [counted(one.experiment, one.verdicts) for one in judged],
+        "uses": _uses(judged),
+    }
+    _write(out / PAGE, filled(package, "page.html.j2", title="Experiments", **content))
+    _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, **content))
     verdicts = {one.experiment.name: [_document(v) for v in one.verdicts] for one in judged}
     _write(out / VERDICTS, json.dumps(verdicts, indent=2, allow_nan=False) + "\n")
     write_costs(out, [one.experiment.name for one in judged])
+
+
+def _uses(judged: Sequence[JudgedExperiment]) -> list[dict[str, Any]]:
+    """Rows of what information is good for, of the experiments that are there."""
+    files = {one.experiment.name: one.experiment.file for one in judged}
+    found = judged_uses(read_uses(), {one.experiment.name: one.verdicts for one in judged})
+    return [
+        {
+            "what": use.what,
+            "experiment": use.experiment,
+            **_verdict_row(verdict, files[use.experiment].metrics[verdict.rule.metric]),
+        }
+        for use, verdict in found
+    ]
 
 
 def _write(path: Path, text: str) -> None:
