@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -86,6 +87,7 @@ def run(
     from duagc.pipeline.cache.store import default_store
     from duagc.pipeline.experiments.carry_out import carry_out, check_packages, check_place, check_recordings
     from duagc.pipeline.experiments.pages import PAGE, judge_folder, write_report
+    from duagc.pipeline.experiments.predicted import predicted_each_s, time_left_s
     from duagc.pipeline.experiments.rule import experiment_names, read_experiment
 
     if engine not in ("local", "slurm", "ray"):
@@ -99,8 +101,16 @@ def run(
         check_packages(experiment, profile)
         check_place(experiment, profile, out)
     check_recordings(chosen, recordings)
-    failed = []
-    for experiment in chosen:
+    failed: list[str] = []
+    took_s: list[float] = []
+    predicted_s = predicted_each_s(chosen, profile)
+    for number, experiment in enumerate(chosen, 1):
+        begun = time.monotonic()
+        if len(chosen) > 1:
+            left_min = time_left_s(predicted_s, took_s, workers) / 60
+            say(
+                f"{experiment.name}: experiment {number} of {len(chosen)}, about {left_min:.0f} min left in all"
+            )
         with engine_of(engine, workers, out / experiment.name) as opened:
             failed += carry_out(
                 experiment,
@@ -111,6 +121,7 @@ def run(
                 store=store or default_store(out / "run"),
                 log=say,
             )
+        took_s.append(time.monotonic() - begun)
     write_report(out, judge_folder(out))
     print(f"page       {out / PAGE}")
     if failed:

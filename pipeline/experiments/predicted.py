@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from duagc.pipeline.cache import durations
 from duagc.pipeline.config.base import load_config
@@ -18,6 +19,8 @@ PIXEL_STEPS_PER_S = 1e7
 """Pixels that tracking by rendering looks at in a second."""
 OPEN3D_FRAMES_PER_S = 10
 """Of Open3D's dense SLAM, with voxels of 2 cm."""
+FOUND_SHARE = 0.05
+"""Of the predicted time, up to which an experiment was found, not computed."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,32 @@ def predicted_time(experiments: Sequence[Experiment], profile: str) -> Predicted
                 different["front end", *recording, images] = front_s
     count = sum(key[0] == "run" for key in different)
     return PredictedTime(runs, count, sum(different.values()))
+
+
+def time_left_s(predicted_s: Sequence[float], took_s: Sequence[float], workers: int) -> float:
+    """Wall time of the experiments that are left, at the pace of those that were computed.
+
+    Args:
+        predicted_s: processor time of each, without what those before it compute.
+        took_s: wall time of each that is done; those found in the store took next to none, and say nothing.
+        workers: runs at the same time.
+    """
+    pairs = list(zip(predicted_s, took_s, strict=False))
+    computed = [(predicted, took) for predicted, took in pairs if took > FOUND_SHARE * predicted]
+    before_s, wall_s = (sum(side) for side in zip((0.0, 0.0), *computed, strict=True))
+    pace = wall_s / before_s if before_s else 1 / workers
+    return pace * sum(predicted_s[len(took_s) :])
+
+
+def predicted_each_s(experiments: Sequence[Experiment], profile: str) -> list[float]:
+    """Processor time of experiments one after the other, each without what those before it have computed.
+
+    Args:
+        experiments: in their order.
+        profile: name of how much is computed.
+    """
+    up_to = [predicted_time(experiments[:k], profile).cpu_s for k in range(len(experiments) + 1)]
+    return [after - before for before, after in pairwise(up_to)]
 
 
 def _times(data: SimulatedData, config: RunConfig) -> tuple[float, float]:

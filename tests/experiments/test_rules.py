@@ -11,7 +11,7 @@ from duagc.pipeline.batch.suite import SuiteFile
 from duagc.pipeline.evaluation.pixel_errors import MAPS, NAMES, SETS
 from duagc.pipeline.experiments.carry_out import check_recordings, prepare
 from duagc.pipeline.experiments.metric_names import KNOWN, names_in, needs_truth
-from duagc.pipeline.experiments.predicted import predicted_time
+from duagc.pipeline.experiments.predicted import predicted_each_s, predicted_time, time_left_s
 from duagc.pipeline.experiments.rule import RULES, data_of, experiment_names, read_experiment
 from tests.fixtures import fake_run
 from tests.fixtures.commands import assert_one_line, duagc_here
@@ -161,6 +161,16 @@ def test_what_experiments_take_counts_equal_runs_once(folder: Path) -> None:
     both = predicted_time([mine, read_experiment("twin", folder)], "small")
     assert (both.runs, both.different, both.cpu_s) == (20, 10, alone.cpu_s)
     assert predicted_time([read_experiment("larger", folder)], "small").cpu_s > alone.cpu_s
+    assert predicted_each_s([mine, read_experiment("twin", folder)], "small") == [alone.cpu_s, 0.0]
+
+
+def test_the_time_left_is_that_of_the_pace_so_far() -> None:
+    predicted_s = [100.0, 200.0, 300.0]
+    assert time_left_s(predicted_s, [], workers=2) == 300
+    assert time_left_s(predicted_s, [80.0], workers=2) == pytest.approx(400)
+    assert time_left_s(predicted_s, [0.5, 100.0], workers=2) == pytest.approx(150)  # the first was found
+    assert time_left_s(predicted_s, [0.5], workers=2) == 250
+    assert time_left_s(predicted_s, [80.0, 90.0, 100.0], workers=2) == 0
 
 
 def test_a_front_end_counts_once_for_all_that_comes_after_it(folder: Path) -> None:
