@@ -77,13 +77,12 @@ def filled(color: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
         return color
     if not mask.any():
         return np.zeros_like(color)
-    # a usable pixel is a zero of the distance transform, and has a label of its own
+    # a usable pixel is a zero of the distance transform; zeros are numbered from 1, row by row
     _, labels = cv2.distanceTransformWithLabels(
         (~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    usable = np.flatnonzero(mask)
-    pixel_of_label = np.zeros(int(labels.max()) + 1, dtype=np.int64)
-    pixel_of_label[labels.ravel()[usable]] = usable
+    others = np.flatnonzero(~mask)
+    nearest = np.flatnonzero(mask)[labels.ravel()[others] - 1]
     out = color.copy()
-    out[~mask] = color.reshape(-1, color.shape[-1])[pixel_of_label[labels[~mask]]]
+    out.reshape(-1, color.shape[-1])[others] = color.reshape(-1, color.shape[-1])[nearest]
     return out

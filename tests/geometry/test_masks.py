@@ -60,6 +60,18 @@ def test_the_color_is_that_of_a_pixel_next_to_it() -> None:
     assert (filled[:, 3:] == 200).all()
 
 
+def test_no_usable_pixel_is_much_nearer_than_the_one_that_fills() -> None:
+    v, u = np.mgrid[:24, :32]
+    color = np.stack([v, u, 0 * v], axis=2).astype(np.uint8)  # says where it is
+    for seed in range(20):
+        mask = mask_of(seed, share=0.1 + 0.04 * seed, shape=(24, 32))
+        if mask.any():
+            found = masks.filled(color, mask).astype(int)
+            away = np.hypot(found[..., 0] - v, found[..., 1] - u)
+            # OpenCV's 5x5 steps miss the Euclidean distance by some percent
+            np.testing.assert_array_less(away, 1.1 * masks.distance_px(~mask) + 0.5)
+
+
 def test_distances_are_to_masked_pixels() -> None:
     mask = np.ones((5, 8), bool)
     assert np.isinf(masks.distance_px(mask)).all()
