@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.fusion.context import MapContext
@@ -14,6 +16,7 @@ from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
 from duagc.pipeline.runs.robot_data import AgentInput
+from duagc.pipeline.splat.gaussians import seen_distance_m
 
 
 def context_of(run: RunFolder, camera: PinholeCamera, depth: DepthKind, threads: int) -> MapContext:
@@ -70,4 +73,6 @@ def images_of(run: RunFolder, robot: RobotRun, source: Recording, poses: Array) 
     frames = [f for f in robot.frames if f.status != "lost"]
     config = run.config.fusion.finetune
     num_support = config.at_most(config.support_views, len(robot.keyframes))
-    return training_views(files, frames, poses, num_support=num_support, moving=run.config.frontend.moving)
+    seen_m = seen_distance_m(robot.own_map.gaussians, np.array([k.T_map_camera for k in robot.keyframes]))
+    moving = run.config.frontend.moving
+    return training_views(files, frames, poses, num_support=num_support, seen_m=seen_m, moving=moving)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, tracked_path
 from duagc.pipeline.frontend.view_gain import ViewGain
+from duagc.pipeline.geometry.image_motion import image_speeds, slowest_of_parts
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import Keyframe
+from duagc.pipeline.splat.gaussians import seen_distance_m
 
 CONSIDERED = 4
 """Frames whose gain is computed, as a multiple of those that are chosen."""
@@ -43,6 +47,13 @@ def supporting_frames(
         and not is_held_out(frame.frame_index)
     ]
     count = min(tiles * config.mapping.support_views, len(candidates))
+    T_map_keyframe = np.array([k.T_map_camera for k in keyframes])
+    if config.mapping.support_choice == "steady":
+        path = tracked_path(frames, T_map_keyframe)
+        speeds = image_speeds(path, seen_distance_m(gain.gaussians, T_map_keyframe))
+        of_stamp = dict(zip(path.stamps_ns.tolist(), speeds, strict=True))
+        chosen = slowest_of_parts([of_stamp[frame.stamp_ns] for frame in candidates], count)
+        return [candidates[k] for k in chosen]
     if config.mapping.support_choice == "spread":
         return [candidates[k] for k in evenly_spaced(len(candidates), count)]
     if config.mapping.support_choice == "random":
@@ -50,7 +61,7 @@ def supporting_frames(
         return [candidates[k] for k in sorted(draw.permutation(len(candidates))[:count])]
     considered = evenly_spaced(len(candidates), min(CONSIDERED * count, len(candidates)))
     candidates = [candidates[k] for k in considered]
-    poses = [keyframes[frame.keyframe_index].T_map_camera @ frame.T_keyframe_camera for frame in candidates]
+    poses = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in candidates]
     least = config.mapping.support_choice == "reversed"
-    chosen = gain.chosen([k.T_map_camera for k in keyframes], poses, count, least=least)
+    chosen = gain.chosen(list(T_map_keyframe), poses, count, least=least)
     return [candidates[k] for k in chosen]

@@ -26,8 +26,8 @@ from duagc.pipeline.fusion.most_drawn import most_drawn
 from duagc.pipeline.fusion.opacity_update import update_opacities
 from duagc.pipeline.fusion.peer_validation import PeerCheck, ValidatedPeers, validate_peer_maps
 from duagc.pipeline.fusion.peer_views import peer_views
+from duagc.pipeline.geometry.image_motion import image_speeds, slowest_of_parts
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
     WORLD_FRAME,
@@ -44,7 +44,7 @@ from duagc.pipeline.recording.moved_depth import depth_delay_ns
 from duagc.pipeline.recording.shutter import found_shutter_s
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
-from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.gaussians import Gaussians, seen_distance_m
 from duagc.pipeline.splat.information import (
     COLOR_INFORMATION,
     OPACITY_INFORMATION,
@@ -111,7 +111,10 @@ def run_fusion(
     views: Sequence[PosedRgbd] = []
     if len(result.component) > 1:
         num_support = config.finetune.at_most(config.finetune.support_views, own.keyframes)
-        views = training_views(source, frames, T_world_camera, num_support=num_support, moving=moving)
+        seen_m = seen_distance_m(own.gaussians, own.T_map_keyframe)
+        views = training_views(
+            source, frames, T_world_camera, num_support=num_support, seen_m=seen_m, moving=moving
+        )
     fusion = _fuse(own, result, views, context, save=checkpoints or Checkpoints())
     refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
     write_ply(folder / "fused.ply", fusion.fused.gaussians)
@@ -246,15 +249,17 @@ def training_views(
     T_world_camera: Array,
     *,
     num_support: int,
+    seen_m: float,
     moving: MovingConfig,
 ) -> Sequence[PosedRgbd]:
-    """The robot's keyframes and, evenly spread, frames between them; none held out.
+    """The robot's keyframes and, of equal parts of its path, the sharpest frame between them; none held out.
 
     Args:
         source: the robot's own files.
         frames: that have a pose, in order.
         T_world_camera: [n, 4, 4], these poses, in the frame of the views.
         num_support: most frames between keyframes.
+        seen_m: how far away they see things.
         moving: as the front end looked for what moves.
     """
     topic = topics.KEYFRAME.of(source.robot)
@@ -262,11 +267,12 @@ def training_views(
     first = [k for k, f in enumerate(frames) if f.frame_index in keyframes]
     others = [k for k, f in enumerate(frames) if f.frame_index not in keyframes and not f.held_out]
     count = min(num_support, len(others))
-    middles = [others[k] for k in evenly_spaced(len(others), count)]
+    stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+    path = Trajectory(stamps, np.array([frame.T_map_camera for frame in frames]))
+    speeds = image_speeds(path, seen_m)
+    between = [others[k] for k in slowest_of_parts(speeds[others], count)]
     exposures = read_exposures(source.frontend, source.robot)
     with open_rgbd(source.log) as log:
-        stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
-        path = Trajectory(stamps, np.array([frame.T_map_camera for frame in frames]))
         log.delay_depth(depth_delay_ns(source.frontend))
         log.move_depth(path)
         log.open_shutter(found_shutter_s(source.frontend), path)
@@ -281,7 +287,7 @@ def training_views(
             found = PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure)
             return replace(found, T_camera_moment=frame.T_camera_moment)
 
-        views = ShelvedList(map(posed, (*first, *middles)))
+        views = ShelvedList(map(posed, (*first, *between)))
     return ShelvedList(replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views)
 
 

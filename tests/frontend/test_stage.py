@@ -207,7 +207,7 @@ def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> N
     forbidden = {4, 7, 12, *(m.frame_index for m in keyframes)}
     gain = ViewGain(wall(), "blended", CAMERA, MappingConfig(), 0, 1)
     for count in (0, 3, 100):
-        for choice in ("spread", "random", "information", "reversed"):
+        for choice in ("steady", "spread", "random", "information", "reversed"):
             mapping = MappingConfig(support_views=count, support_choice=choice)
             config = TRACKING.model_copy(update={"mapping": mapping})
             chosen = [f.frame_index for f in supporting_frames(frames, made, config, gain)]
