@@ -73,7 +73,7 @@ def _views(
         if name != drawn:
             own_colors = colors[name].of(evidence[name])
             gaussians, drawn = gaussians_of(own_colors.ids, own_colors.anchors, own_colors.theta), name
-            sigma_m, _ = sigma_along(own_colors.position_information(), gaussians.normals())
+            F_position = own_colors.position_information()
         T_camera_world = se3.inverse(T_world_camera)
         render = rasterizer.forward(gaussians, context.camera, T_camera_world, depth_kind=depth_kinds[name])
         seen = render.alpha >= COVERED
@@ -83,7 +83,7 @@ def _views(
                 < 0.5
             )
         elif kind != "covered":
-            stated = _relative_sigma(gaussians, sigma_m, context, T_camera_world)
+            stated = _relative_sigma(gaussians, F_position, context, T_camera_world)
             middle = np.median(stated[seen]) if seen.any() else 0.0
             seen &= stated <= middle if kind == "certain" else stated > middle
         share = np.where(seen, render.alpha, np.float32(1))
@@ -93,13 +93,13 @@ def _views(
 
 
 def _relative_sigma(
-    gaussians: Gaussians, sigma_m: Array, context: MapContext, T_camera_world: Array
+    gaussians: Gaussians, F_position: Array, context: MapContext, T_camera_world: Array
 ) -> NDArray[np.float32]:
     """Stated deviation of what a pixel blends, over its depth [h, w]; infinite where nothing is stated.
 
-    sigma_m: [n], of every Gaussian across its disc; infinite where none is stated.
+    F_position: [n, 3, 3], information of the means, 1/m^2.
     """
-    known = np.isfinite(sigma_m)
+    sigma_m, known = sigma_along(F_position, gaussians.normals())
     colors = np.stack([np.where(known, sigma_m, 0.0), known, known], axis=1)
     rasterizer = Rasterizer(threads=context.threads)
     drawn = rasterizer.forward(gaussians.replace(colors=colors), context.camera, T_camera_world)
