@@ -87,10 +87,11 @@ class MappingConfig(Config):
     pose_rate: float = Field(default=0.25, ge=0.0)
     """Largest step of the pose of a view in the final optimization, in standard deviations by tracking, where depth is
     not exact; it falls as the learning rates do. 0: poses stay where tracking and pose graph put them."""
-    support_choice: Literal["steady", "spread", "random", "information", "reversed"] = "steady"
+    support_choice: Literal["auto", "steady", "spread", "random", "information", "reversed"] = "auto"
     """Which ones. steady: of equal parts of the log those during which images move least, which are the sharpest;
-    to compare with, the middles of these parts (spread), drawn at random, or those by which the map, as it is before
-    the final optimization, would know most (information), or least (reversed), more than by the keyframes."""
+    spread: the middles of these parts; auto: steady where depth is not exact. To compare with, drawn at random, or
+    those by which the map, as it is before the final optimization, would know most (information), or least (reversed),
+    more than by the keyframes."""
     support_seeds: bool = True
     """Whether supporting frames insert Gaussians where no keyframe saw anything."""
     densify_rounds: int = 4

@@ -73,6 +73,7 @@ def images_of(run: RunFolder, robot: RobotRun, source: Recording, poses: Array) 
     frames = [f for f in robot.frames if f.status != "lost"]
     config = run.config.fusion.finetune
     num_support = config.at_most(config.support_views, len(robot.keyframes))
-    seen_m = seen_distance_m(robot.own_map.gaussians, np.array([k.T_map_camera for k in robot.keyframes]))
+    T_map_keyframe, own = np.array([k.T_map_camera for k in robot.keyframes]), robot.own_map
+    seen_m = None if own.depth == "ray_plane" else seen_distance_m(own.gaussians, T_map_keyframe)
     moving = run.config.frontend.moving
     return training_views(files, frames, poses, num_support=num_support, seen_m=seen_m, moving=moving)

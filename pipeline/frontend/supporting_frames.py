@@ -48,20 +48,22 @@ def supporting_frames(
     ]
     count = min(tiles * config.mapping.support_views, len(candidates))
     T_map_keyframe = np.array([k.T_map_camera for k in keyframes])
-    if config.mapping.support_choice == "steady":
+    choice = config.mapping.support_choice
+    if choice == "auto":
+        choice = "spread" if gain.depth == "ray_plane" else "steady"
+    if choice == "steady":
         path = tracked_path(frames, T_map_keyframe)
         speeds = image_speeds(path, seen_distance_m(gain.gaussians, T_map_keyframe))
         of_stamp = dict(zip(path.stamps_ns.tolist(), speeds, strict=True))
         chosen = slowest_of_parts([of_stamp[frame.stamp_ns] for frame in candidates], count)
         return [candidates[k] for k in chosen]
-    if config.mapping.support_choice == "spread":
+    if choice == "spread":
         return [candidates[k] for k in evenly_spaced(len(candidates), count)]
-    if config.mapping.support_choice == "random":
+    if choice == "random":
         draw = random_streams.generator(gain.seed, "mapping.support")
         return [candidates[k] for k in sorted(draw.permutation(len(candidates))[:count])]
     considered = evenly_spaced(len(candidates), min(CONSIDERED * count, len(candidates)))
     candidates = [candidates[k] for k in considered]
     poses = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in candidates]
-    least = config.mapping.support_choice == "reversed"
-    chosen = gain.chosen(list(T_map_keyframe), poses, count, least=least)
+    chosen = gain.chosen(list(T_map_keyframe), poses, count, least=choice == "reversed")
     return [candidates[k] for k in chosen]

@@ -28,6 +28,7 @@ from duagc.pipeline.fusion.peer_validation import PeerCheck, ValidatedPeers, val
 from duagc.pipeline.fusion.peer_views import peer_views
 from duagc.pipeline.geometry.image_motion import image_speeds, slowest_of_parts
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
     WORLD_FRAME,
@@ -111,7 +112,7 @@ def run_fusion(
     views: Sequence[PosedRgbd] = []
     if len(result.component) > 1:
         num_support = config.finetune.at_most(config.finetune.support_views, own.keyframes)
-        seen_m = seen_distance_m(own.gaussians, own.T_map_keyframe)
+        seen_m = None if own.depth == "ray_plane" else seen_distance_m(own.gaussians, own.T_map_keyframe)
         views = training_views(
             source, frames, T_world_camera, num_support=num_support, seen_m=seen_m, moving=moving
         )
@@ -249,17 +250,17 @@ def training_views(
     T_world_camera: Array,
     *,
     num_support: int,
-    seen_m: float,
+    seen_m: float | None,
     moving: MovingConfig,
 ) -> Sequence[PosedRgbd]:
-    """The robot's keyframes and, of equal parts of its path, the sharpest frame between them; none held out.
+    """The robot's keyframes and, of equal parts of its path, a frame between them; none held out.
 
     Args:
         source: the robot's own files.
         frames: that have a pose, in order.
         T_world_camera: [n, 4, 4], these poses, in the frame of the views.
         num_support: most frames between keyframes.
-        seen_m: how far away they see things.
+        seen_m: how far away they see things, to take frames that move least; None: the middles of the parts.
         moving: as the front end looked for what moves.
     """
     topic = topics.KEYFRAME.of(source.robot)
@@ -269,8 +270,11 @@ def training_views(
     count = min(num_support, len(others))
     stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
     path = Trajectory(stamps, np.array([frame.T_map_camera for frame in frames]))
-    speeds = image_speeds(path, seen_m)
-    between = [others[k] for k in slowest_of_parts(speeds[others], count)]
+    if seen_m is None:
+        chosen = evenly_spaced(len(others), count)
+    else:
+        chosen = slowest_of_parts(image_speeds(path, seen_m)[others], count)
+    between = [others[k] for k in chosen]
     exposures = read_exposures(source.frontend, source.robot)
     with open_rgbd(source.log) as log:
         log.delay_depth(depth_delay_ns(source.frontend))

@@ -25,6 +25,7 @@ from duagc.pipeline.geometry.trajectory import ate_rmse_m
 from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import content_digest, log_metadata, read_log
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS
 from duagc.schemas import topics
 from tests.fixtures.moving_ball import RADIUS_M, with_ball
 from tests.fixtures.room import CAMERA, pose, render
@@ -207,13 +208,41 @@ def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> N
     forbidden = {4, 7, 12, *(m.frame_index for m in keyframes)}
     gain = ViewGain(wall(), "blended", CAMERA, MappingConfig(), 0, 1)
     for count in (0, 3, 100):
-        for choice in ("steady", "spread", "random", "information", "reversed"):
+        for choice in ("auto", "steady", "spread", "random", "information", "reversed"):
             mapping = MappingConfig(support_views=count, support_choice=choice)
             config = TRACKING.model_copy(update={"mapping": mapping})
             chosen = [f.frame_index for f in supporting_frames(frames, made, config, gain)]
             assert chosen == sorted(set(chosen))
             assert not forbidden & set(chosen)
             assert len(chosen) == min(count, FRAMES - len(forbidden))
+
+
+def test_where_depth_is_not_exact_the_map_is_trained_on_the_frames_that_move_least() -> None:
+    pauses, frames, x = {9, 23}, [], 0.0
+    for k in range(32):
+        x += 0.0 if k in pauses or k - 1 in pauses else 0.02
+        T = np.eye(4)
+        T[0, 3] = x
+        frames.append(
+            TrackedFrame(
+                frame_index=k,
+                stamp_ns=33_333_333 * k,
+                keyframe_index=0,
+                T_keyframe_camera=T,
+                information=np.zeros((6, 6)),
+                status=Status.OK,
+                overlap=1.0,
+                rms_depth_m=0.0,
+                rms_gray=0.0,
+            )
+        )
+    first = Keyframe(0, "alpha", 0, 0, np.eye(4), -1, np.eye(4), np.zeros((6, 6)), (1.0, 0.0))
+    config = TRACKING.model_copy(update={"mapping": MappingConfig(support_views=2)})
+    chosen = {}
+    for depth in DEPTH_KINDS:
+        gain = ViewGain(wall(), depth, CAMERA, config.mapping, 0, 1)
+        chosen[depth] = [f.frame_index for f in supporting_frames(frames, [first], config, gain)]
+    assert chosen == {"blended": sorted(pauses), "ray_plane": [8, 24]}
 
 
 def test_a_missing_log_is_named(tmp_path: Path) -> None:
