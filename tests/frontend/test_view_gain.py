@@ -20,7 +20,7 @@ def test_a_view_of_what_was_not_seen_is_chosen_first_and_what_was_seen_last() ->
     assert gain.information(away).sum() == 0
     assert gain.chosen([POSES[0]], [away, POSES[0], aside], 1) == [2]
     assert gain.chosen([POSES[0]], [away, POSES[0], aside], 1, least=True) == [0]
-    # once a view was taken, its like tells less than another
+    # once a view was taken, its like adds less than another
     assert gain.chosen([], [aside, aside, POSES[0]], 2) == [0, 2]
 
 
@@ -31,11 +31,11 @@ def test_no_other_pair_tells_more_than_that_of_the_largest_gains() -> None:
     own = [gain.information(T) for T in candidates]
     assert sum(information.any() for information in own) > 2
 
-    def told(chosen: list[int]) -> float:
+    def gained(chosen: list[int]) -> float:
         return float(np.sum(np.log1p(sum(own[k] for k in chosen) / known)))
 
-    best = told(gain.chosen(seen, candidates, 2))
-    every = [told([i, j]) for i in range(len(own)) for j in range(i)]
+    best = gained(gain.chosen(seen, candidates, 2))
+    every = [gained([i, j]) for i in range(len(own)) for j in range(i)]
     assert best >= (1 - 1 / np.e) * max(every)  # the bound of a greedy choice (Nemhauser et al. 1978)
     assert best > np.median(every)
-    assert told(gain.chosen(seen, candidates, 2, least=True)) < np.median(every)
+    assert gained(gain.chosen(seen, candidates, 2, least=True)) < np.median(every)
