@@ -17,6 +17,7 @@ from duagc.pipeline.consensus.evidence import rows_by_id, stated_positions
 from duagc.pipeline.evaluation.rendering import in_world
 from duagc.pipeline.evaluation.views import surface_depth
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.kernels.blended_values import blended_values
 from duagc.pipeline.messages import GaussianInformation, GaussianMap
 from duagc.pipeline.runs.folder import RobotRun, position_information
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -139,16 +140,20 @@ def rendered_depth(
         mask: bool [h, w], pixels that are drawn; the others are 0. None: all.
     """
     T = np.asarray(T_camera_map, dtype=np.float64)
-    known = np.isfinite(stated.sigma_m)
-    along_ray_m = np.where(known, _along_rays(stated, T), 0.0)
-    gaussians = stated.gaussians.replace(colors=np.stack([along_ray_m, known, known], axis=1))
-    render = rasterizer.forward(gaussians, camera, T, depth_kind=stated.depth, mask=mask)
-    layer_m, depth_m = rasterizer.layer_depth(), surface_depth(render)
+    blended = blended_values(
+        stated.gaussians,
+        _along_rays(stated, T),
+        camera,
+        T,
+        rasterizer=rasterizer,
+        depth_kind=stated.depth,
+        mask=mask,
+    )
+    layer_m, depth_m = rasterizer.layer_depth(), surface_depth(blended.render)
     sigma_m = np.zeros_like(depth_m)
-    weight = render.color[..., 1]
-    drawn = (depth_m > 0) & (weight >= LEAST_STATED * render.alpha)
+    drawn = (depth_m > 0) & (blended.weight >= LEAST_STATED * blended.render.alpha)
     between_m = np.where(layer_m[drawn] > 0, depth_m[drawn] - layer_m[drawn], 0.0)
-    sigma_m[drawn] = np.hypot(render.color[..., 0][drawn] / weight[drawn], between_m)
+    sigma_m[drawn] = np.hypot(blended.mean[drawn], between_m)
     return RenderedDepth(depth_m, sigma_m)
 
 

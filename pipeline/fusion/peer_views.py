@@ -23,6 +23,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.kernels.blended_values import blended_values
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import gaussians_of, sigma_along
 
@@ -77,13 +78,12 @@ def _views(
         T_camera_world = se3.inverse(T_world_camera)
         render = rasterizer.forward(gaussians, context.camera, T_camera_world, depth_kind=depth_kinds[name])
         seen = render.alpha >= COVERED
-        if (kind := context.config.finetune.peer_pixels) == "random":
-            seen &= (
-                random_streams.generator(context.seed, "fusion.peer-pixels", view=number).random(seen.shape)
-                < 0.5
-            )
+        kind = context.config.finetune.peer_pixels
+        if kind == "random":
+            stream = random_streams.generator(context.seed, "fusion.peer-pixels", view=number)
+            seen &= stream.random(seen.shape) < 0.5
         elif kind != "covered":
-            stated = _relative_sigma(gaussians, F_position, context, T_camera_world)
+            stated = _relative_sigma(gaussians, F_position, context, T_camera_world, depth=depth_kinds[name])
             middle = np.median(stated[seen]) if seen.any() else 0.0
             seen &= stated <= middle if kind == "certain" else stated > middle
         share = np.where(seen, render.alpha, np.float32(1))
@@ -93,20 +93,24 @@ def _views(
 
 
 def _relative_sigma(
-    gaussians: Gaussians, F_position: Array, context: MapContext, T_camera_world: Array
+    gaussians: Gaussians, F_position: Array, context: MapContext, T_camera_world: Array, *, depth: DepthKind
 ) -> NDArray[np.float32]:
     """Stated deviation of what a pixel blends, over its depth [h, w]; infinite where nothing is stated.
 
     F_position: [n, 3, 3], information of the means, 1/m^2.
     """
-    sigma_m, known = sigma_along(F_position, gaussians.normals())
-    colors = np.stack([np.where(known, sigma_m, 0.0), known, known], axis=1)
-    rasterizer = Rasterizer(threads=context.threads)
-    drawn = rasterizer.forward(gaussians.replace(colors=colors), context.camera, T_camera_world)
-    weight, depth = drawn.color[..., 1], drawn.depth / np.maximum(drawn.alpha, np.float32(1e-6))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sigma = np.where(weight > 0, drawn.color[..., 0] / weight / depth, np.float32(np.inf))
-    return np.asarray(sigma, dtype=np.float32)
+    sigma_m, _ = sigma_along(F_position, gaussians.normals())
+    blended = blended_values(
+        gaussians,
+        sigma_m,
+        context.camera,
+        T_camera_world,
+        rasterizer=Rasterizer(threads=context.threads),
+        depth_kind=depth,
+    )
+    depth_m = blended.render.depth / np.maximum(blended.render.alpha, np.float32(1e-6))
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.where(blended.weight > 0, blended.mean / depth_m, np.float32(np.inf)))
 
 
 def _with_middles(T: Array) -> Array:
