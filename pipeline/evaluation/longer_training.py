@@ -16,7 +16,7 @@ from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
 from duagc.pipeline.runs.robot_data import AgentInput
-from duagc.pipeline.splat.gaussians import seen_distance_m
+from duagc.pipeline.splat.training_frames import blur_distance_m
 
 
 def context_of(run: RunFolder, camera: PinholeCamera, depth: DepthKind, threads: int) -> MapContext:
@@ -74,6 +74,6 @@ def images_of(run: RunFolder, robot: RobotRun, source: Recording, poses: Array) 
     config = run.config.fusion.finetune
     num_support = config.at_most(config.support_views, len(robot.keyframes))
     T_map_keyframe, own = np.array([k.T_map_camera for k in robot.keyframes]), robot.own_map
-    seen_m = None if own.depth == "ray_plane" else seen_distance_m(own.gaussians, T_map_keyframe)
+    seen_m = blur_distance_m(own.gaussians, T_map_keyframe, own.depth)
     moving = run.config.frontend.moving
     return training_views(files, frames, poses, num_support=num_support, seen_m=seen_m, moving=moving)

@@ -103,8 +103,10 @@ class MapBuilder:
         del state  # or it would be in memory twice
         unrefined = self._whole.gaussians
         clock.lap("mapping_s")
-        gain = ViewGain(unrefined, self._depth, self.log.camera, config.mapping, self._seed, threads)
-        supporting = supporting_frames(frames, keyframes, config, gain, tiles=len(self._tiles))
+        gain = ViewGain(unrefined, self._depth, self.log.camera, config.mapping, threads)
+        supporting = supporting_frames(
+            frames, keyframes, config, gain, tiles=len(self._tiles), seed=self._seed
+        )
         path = tracked_path(frames, np.array([k.T_map_camera for k in keyframes]))
         search = ShutterSearch(
             self.log, config.mapping, path, self._posed, depth=self._depth, threads=threads
@@ -139,8 +141,8 @@ class MapBuilder:
             self._free.add(depth_m, keyframe.T_map_camera)
             self._sights.append(ViewExtent.of(depth_m, self.log.camera))
         centers = [
-            se3.transform(k.T_map_camera, s.center_camera[None])[0]
-            for k, s in zip(keyframes, self._sights, strict=True)
+            se3.transform(k.T_map_camera, sight.center_camera[None])[0]
+            for k, sight in zip(keyframes, self._sights, strict=True)
         ]
         config, every = self.config.mapping, list(range(len(keyframes)))
         whole = len(every) <= config.whole_keyframes
@@ -156,7 +158,9 @@ class MapBuilder:
             self._whole.go_on(whole)
         steps = self._budget.keyframe_steps([keyframe.stamp_ns for keyframe in self._keyframes])
         wanted = self.config.mapping.iterations * count
-        self._left_out(wanted - sum(steps), wanted, "at keyframes", "keyframe_megapixels_s")
+        self._budget.say_left_out(
+            self._checkpoints.say, self.name, (wanted - sum(steps), wanted), "keyframe_megapixels_s"
+        )
         for number, tile in enumerate(self._tiles[first:], first):
             before = [k for earlier in self._tiles[:number] for k in earlier]
             done = len(updates) - len(before)
@@ -245,7 +249,9 @@ class MapBuilder:
             for tile, between, near, share_s in zip(self._tiles, of_tile, borders, shares_s, strict=True)
         ]
         wanted, steps = (sum(counts) for counts in zip(*plans, strict=True))
-        self._left_out(wanted - steps, wanted, "of the final optimization", "final_megapixels_s")
+        self._budget.say_left_out(
+            self._checkpoints.say, self.name, (wanted - steps, wanted), "final_megapixels_s"
+        )
         joint_share = self.config.mapping.joint_share if len(self._tiles) > 1 else 0.0
         alone = [alone_steps(taken, joint_share) for _, taken in plans]
         first, found = 0, None
@@ -335,14 +341,6 @@ class MapBuilder:
     def _moments(self, frame_index: int) -> Array | None:
         """Where the camera is while its shutter is open, seen from the middle; None: it stands still."""
         return None if self.log.shutter is None else self.log.frame(frame_index).T_camera_moment
-
-    def _left_out(self, steps: int, wanted: int, which: str, setting: str) -> None:
-        """Say what a budget leaves out."""
-        if steps:
-            self._checkpoints.say(
-                f"warning: {self.name}: {steps} of {wanted} training steps {which} are left out "
-                f"by frontend.mapping.{setting}"
-            )
 
     def _pose(self, keyframe: int) -> Array:
         """T_map_camera of a keyframe, as refined so far."""

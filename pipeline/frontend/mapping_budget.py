@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -51,6 +51,25 @@ class MappingBudget:
         seen = 1 - 0.5 * sparse.until if sparse.checkerboard else 1.0
         pixels = seen * self.camera.width * self.camera.height
         return wanted, int(min(wanted, 1e6 * config.final_megapixels_s * log_s / pixels))
+
+    def say_left_out(
+        self, say: Callable[[str], None], name: str, steps: tuple[int, int], setting: str
+    ) -> None:
+        """Say what a budget leaves out, if anything.
+
+        Args:
+            say: gets the line.
+            name: of the component.
+            steps: how many are left out, and of how many.
+            setting: of the mapping that is the budget.
+        """
+        left_out, wanted = steps
+        if left_out:
+            which = "at keyframes" if setting == "keyframe_megapixels_s" else "of the final optimization"
+            say(
+                f"warning: {name}: {left_out} of {wanted} training steps {which} are left out "
+                f"by frontend.mapping.{setting}"
+            )
 
 
 def alone_steps(steps: int, joint_share: float) -> int:

@@ -11,10 +11,8 @@ from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, tracked_path
 from duagc.pipeline.frontend.view_gain import ViewGain
-from duagc.pipeline.geometry.image_motion import image_speeds, slowest_of_parts
-from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import Keyframe
-from duagc.pipeline.splat.gaussians import seen_distance_m
+from duagc.pipeline.splat.training_frames import blur_distance_m, seen_distance_m, training_frames
 
 CONSIDERED = 4
 """Frames whose gain is computed, as a multiple of those that are chosen."""
@@ -27,6 +25,7 @@ def supporting_frames(
     gain: ViewGain,
     *,
     tiles: int = 1,
+    seed: int = 0,
 ) -> list[TrackedFrame]:
     """Frames for the final optimization of the map: tracked, no keyframes, not held out; as `support_choice` says.
 
@@ -36,34 +35,32 @@ def supporting_frames(
         config: of the front end.
         gain: of the map that the keyframes have made.
         tiles: of the map; each gets a share.
+        seed: of the run.
     """
+    T_map_keyframe = np.array([k.T_map_camera for k in keyframes])
     taken = {keyframe.frame_index for keyframe in keyframes}
+    placed = [frame for frame in frames if frame.status is not Status.LOST]
     candidates = [
-        frame
-        for frame in frames
-        if frame.status is not Status.LOST
-        and frame.reason is Reason.NONE  # its depth and its color belong together
+        place
+        for place, frame in enumerate(placed)
+        if frame.reason is Reason.NONE  # its depth and its color belong together
         and frame.frame_index not in taken
         and not is_held_out(frame.frame_index)
     ]
     count = min(tiles * config.mapping.support_views, len(candidates))
-    T_map_keyframe = np.array([k.T_map_camera for k in keyframes])
-    choice = config.mapping.support_choice
-    if choice == "auto":
-        choice = "spread" if gain.depth == "ray_plane" else "steady"
-    if choice == "steady":
-        path = tracked_path(frames, T_map_keyframe)
-        speeds = image_speeds(path, seen_distance_m(gain.gaussians, T_map_keyframe))
-        of_stamp = dict(zip(path.stamps_ns.tolist(), speeds, strict=True))
-        chosen = slowest_of_parts([of_stamp[frame.stamp_ns] for frame in candidates], count)
-        return [candidates[k] for k in chosen]
-    if choice == "spread":
-        return [candidates[k] for k in evenly_spaced(len(candidates), count)]
+    path, choice = tracked_path(placed, T_map_keyframe), config.mapping.support_choice
     if choice == "random":
-        draw = random_streams.generator(gain.seed, "mapping.support")
-        return [candidates[k] for k in sorted(draw.permutation(len(candidates))[:count])]
-    considered = evenly_spaced(len(candidates), min(CONSIDERED * count, len(candidates)))
-    candidates = [candidates[k] for k in considered]
-    poses = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in candidates]
-    chosen = gain.chosen(list(T_map_keyframe), poses, count, least=choice == "reversed")
-    return [candidates[k] for k in chosen]
+        draw = random_streams.generator(seed, "mapping.support")
+        chosen = sorted(candidates[k] for k in draw.permutation(len(candidates))[:count])
+    elif choice in ("information", "reversed"):
+        some = training_frames(path, candidates, min(CONSIDERED * count, len(candidates)), None)
+        least = choice == "reversed"
+        chosen = [some[k] for k in gain.chosen(T_map_keyframe, path.poses[some], count, least=least)]
+    else:
+        seen_m = {
+            "auto": blur_distance_m(gain.gaussians, T_map_keyframe, gain.depth),
+            "steady": seen_distance_m(gain.gaussians, T_map_keyframe),
+            "spread": None,
+        }[choice]
+        chosen = training_frames(path, candidates, count, seen_m)
+    return [placed[k] for k in chosen]

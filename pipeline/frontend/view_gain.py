@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import SupportsIndex
 
@@ -29,7 +29,6 @@ class ViewGain:
         depth: of a Gaussian at a pixel.
         camera: of the views.
         config: noise of the images.
-        seed: of the run, for what is drawn at random.
         threads: of the rasterizer; changes no bit.
     """
 
@@ -37,7 +36,6 @@ class ViewGain:
     depth: DepthKind
     camera: PinholeCamera
     config: MappingConfig
-    seed: int
     threads: SupportsIndex
 
     def information(self, T_map_camera: Array) -> Array:
@@ -60,7 +58,7 @@ class ViewGain:
         return information
 
     def chosen(
-        self, seen: Sequence[Array], candidates: Sequence[Array], count: int, *, least: bool = False
+        self, seen: Iterable[Array], candidates: Iterable[Array], count: int, *, least: bool = False
     ) -> list[int]:
         """Candidates, one after the other, of the largest gain over all before; in ascending order.
 
@@ -77,7 +75,7 @@ class ViewGain:
             known += self.information(T_map_camera)
         own = [self.information(T_map_camera) for T_map_camera in candidates]
         taken: list[int] = []
-        left = list(range(len(candidates)))
+        left = list(range(len(own)))
         while left and len(taken) < count:
             gains = [float(np.sum(np.log1p(own[k] / known))) for k in left]
             best = left.pop(int(np.argmin(gains) if least else np.argmax(gains)))

@@ -26,9 +26,7 @@ from duagc.pipeline.fusion.most_drawn import most_drawn
 from duagc.pipeline.fusion.opacity_update import update_opacities
 from duagc.pipeline.fusion.peer_validation import PeerCheck, ValidatedPeers, validate_peer_maps
 from duagc.pipeline.fusion.peer_views import peer_views
-from duagc.pipeline.geometry.image_motion import image_speeds, slowest_of_parts
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
     WORLD_FRAME,
@@ -45,13 +43,14 @@ from duagc.pipeline.recording.moved_depth import depth_delay_ns
 from duagc.pipeline.recording.shutter import found_shutter_s
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
-from duagc.pipeline.splat.gaussians import Gaussians, seen_distance_m
+from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import (
     COLOR_INFORMATION,
     OPACITY_INFORMATION,
     geometry_of_information,
 )
 from duagc.pipeline.splat.ply import write_ply
+from duagc.pipeline.splat.training_frames import blur_distance_m, training_frames
 from duagc.schemas import topics
 
 FUSED_KIND = "gauss_newton"
@@ -112,7 +111,7 @@ def run_fusion(
     views: Sequence[PosedRgbd] = []
     if len(result.component) > 1:
         num_support = config.finetune.at_most(config.finetune.support_views, own.keyframes)
-        seen_m = None if own.depth == "ray_plane" else seen_distance_m(own.gaussians, own.T_map_keyframe)
+        seen_m = blur_distance_m(own.gaussians, own.T_map_keyframe, own.depth)
         views = training_views(
             source, frames, T_world_camera, num_support=num_support, seen_m=seen_m, moving=moving
         )
@@ -260,7 +259,7 @@ def training_views(
         frames: that have a pose, in order.
         T_world_camera: [n, 4, 4], these poses, in the frame of the views.
         num_support: most frames between keyframes.
-        seen_m: how far away they see things, to take frames that move least; None: the middles of the parts.
+        seen_m: of `training_frames`, which takes the others.
         moving: as the front end looked for what moves.
     """
     topic = topics.KEYFRAME.of(source.robot)
@@ -270,11 +269,7 @@ def training_views(
     count = min(num_support, len(others))
     stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
     path = Trajectory(stamps, np.array([frame.T_map_camera for frame in frames]))
-    if seen_m is None:
-        chosen = evenly_spaced(len(others), count)
-    else:
-        chosen = slowest_of_parts(image_speeds(path, seen_m)[others], count)
-    between = [others[k] for k in chosen]
+    between = training_frames(path, others, count, seen_m)
     exposures = read_exposures(source.frontend, source.robot)
     with open_rgbd(source.log) as log:
         log.delay_depth(depth_delay_ns(source.frontend))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry import se3, so3
 
@@ -116,19 +115,3 @@ class Gaussians:
         """
         change = np.asarray(T_new_keyframe) @ se3.inverse(T_old_keyframe)
         return self.transformed(change[self.anchors]) if len(self) else self
-
-
-def seen_distance_m(gaussians: Gaussians, T_map_keyframe: Array) -> float:
-    """How far away keyframes see things: the median distance of Gaussians from the keyframes that they are anchored to.
-
-    Args:
-        gaussians: in the map frame.
-        T_map_keyframe: [k, 4, 4].
-
-    Returns:
-        Meters; 1 for an empty map.
-    """
-    if not len(gaussians):
-        return 1.0
-    away = gaussians.means - T_map_keyframe[gaussians.anchors, :3, 3]
-    return float(np.median(np.linalg.norm(away, axis=1)))

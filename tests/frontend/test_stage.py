@@ -206,7 +206,7 @@ def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> N
         for k, m in enumerate(keyframes)
     ]
     forbidden = {4, 7, 12, *(m.frame_index for m in keyframes)}
-    gain = ViewGain(wall(), "blended", CAMERA, MappingConfig(), 0, 1)
+    gain = ViewGain(wall(), "blended", CAMERA, MappingConfig(), 1)
     for count in (0, 3, 100):
         for choice in ("auto", "steady", "spread", "random", "information", "reversed"):
             mapping = MappingConfig(support_views=count, support_choice=choice)
@@ -240,7 +240,7 @@ def test_where_depth_is_not_exact_the_map_is_trained_on_the_frames_that_move_lea
     config = TRACKING.model_copy(update={"mapping": MappingConfig(support_views=2)})
     chosen = {}
     for depth in DEPTH_KINDS:
-        gain = ViewGain(wall(), depth, CAMERA, config.mapping, 0, 1)
+        gain = ViewGain(wall(), depth, CAMERA, config.mapping, 1)
         chosen[depth] = [f.frame_index for f in supporting_frames(frames, [first], config, gain)]
     assert chosen == {"blended": sorted(pauses), "ray_plane": [8, 24]}
 

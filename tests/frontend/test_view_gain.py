@@ -8,8 +8,8 @@ from duagc.pipeline.geometry import se3
 from tests.fixtures.speckled_wall import CAMERA, POSES, wall
 
 
-def gain_of(seed: int = 0) -> ViewGain:
-    return ViewGain(wall(), "blended", CAMERA, MappingConfig(), seed, 1)
+def gain_of() -> ViewGain:
+    return ViewGain(wall(), "blended", CAMERA, MappingConfig(), 1)
 
 
 def test_a_view_of_what_was_not_seen_is_chosen_first_and_what_was_seen_last() -> None:
