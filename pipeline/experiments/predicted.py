@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 from duagc.pipeline.cache import durations
 from duagc.pipeline.config.base import load_config
@@ -21,6 +20,11 @@ OPEN3D_FRAMES_PER_S = 10
 """Of Open3D's dense SLAM, with voxels of 2 cm."""
 FOUND_SHARE = 0.05
 """Of the predicted time, up to which an experiment was found, not computed."""
+
+
+RUN, FRONT_END = "run", "front end"
+Part = tuple[str, ...]
+"""What is computed once: which of both, of which recording, with which settings."""
 
 
 @dataclass(frozen=True)
@@ -45,21 +49,10 @@ def predicted_time(experiments: Sequence[Experiment], profile: str) -> Predicted
         experiments: the experiments.
         profile: name of how much is computed.
     """
-    runs, different = 0, dict[tuple[str, ...], float]()
-    for experiment in experiments:
-        chosen = experiment.profile(profile)
-        for name in experiment.file.configurations:
-            data = data_of(experiment.file, chosen, name)
-            config = load_config(RunConfig, None, config_of(experiment.file, chosen, name))
-            whole, images = config.model_dump_json(), config.frontend.model_dump_json()
-            front_s, rest_s = _times(data, config)
-            for seed in chosen.seeds:
-                recording = (data.model_dump_json(), str(seed))
-                runs += 1
-                different["run", *recording, whole] = rest_s
-                different["front end", *recording, images] = front_s
-    count = sum(key[0] == "run" for key in different)
-    return PredictedTime(runs, count, sum(different.values()))
+    parts = [_parts(experiment, profile) for experiment in experiments]
+    different = {key: cpu_s for part in parts for key, cpu_s in part}
+    runs = sum(key[0] == RUN for part in parts for key, _ in part)
+    return PredictedTime(runs, sum(key[0] == RUN for key in different), sum(different.values()))
 
 
 def time_left_s(predicted_s: Sequence[float], took_s: Sequence[float], workers: int) -> float:
@@ -70,9 +63,8 @@ def time_left_s(predicted_s: Sequence[float], took_s: Sequence[float], workers: 
         took_s: wall time of each that is done; those found in the store took next to none, and say nothing.
         workers: runs at the same time.
     """
-    pairs = list(zip(predicted_s, took_s, strict=False))
-    computed = [(predicted, took) for predicted, took in pairs if took > FOUND_SHARE * predicted]
-    before_s, wall_s = (sum(side) for side in zip((0.0, 0.0), *computed, strict=True))
+    computed = [k for k, took in enumerate(took_s) if took > FOUND_SHARE * predicted_s[k]]
+    before_s, wall_s = sum(predicted_s[k] for k in computed), sum(took_s[k] for k in computed)
     pace = wall_s / before_s if before_s else 1 / workers
     return pace * sum(predicted_s[len(took_s) :])
 
@@ -84,8 +76,29 @@ def predicted_each_s(experiments: Sequence[Experiment], profile: str) -> list[fl
         experiments: in their order.
         profile: name of how much is computed.
     """
-    up_to = [predicted_time(experiments[:k], profile).cpu_s for k in range(len(experiments) + 1)]
-    return [after - before for before, after in pairwise(up_to)]
+    found: dict[Part, float] = {}
+    each_s = []
+    for experiment in experiments:
+        new = {key: cpu_s for key, cpu_s in _parts(experiment, profile) if key not in found}
+        found |= new
+        each_s.append(sum(new.values()))
+    return each_s
+
+
+def _parts(experiment: Experiment, profile: str) -> list[tuple[Part, float]]:
+    """All front ends and runs of an experiment, by what they compute, with their processor time."""
+    chosen = experiment.profile(profile)
+    parts: list[tuple[Part, float]] = []
+    for name in experiment.file.configurations:
+        data = data_of(experiment.file, chosen, name)
+        config = load_config(RunConfig, None, config_of(experiment.file, chosen, name))
+        whole, images = config.model_dump_json(), config.frontend.model_dump_json()
+        front_s, rest_s = _times(data, config)
+        for seed in chosen.seeds:
+            recording = (data.model_dump_json(), str(seed))
+            parts.append(((RUN, *recording, whole), rest_s))
+            parts.append(((FRONT_END, *recording, images), front_s))
+    return parts
 
 
 def _times(data: SimulatedData, config: RunConfig) -> tuple[float, float]:
