@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from duagc.converters.layouts.own_body import LEAST_IMAGES, MOST_IMAGES, OwnBody
+from duagc.converters.layouts.own_body import LEAST_IMAGES, MOST_IMAGES, OwnBody, percentiles
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.converters.layouts.test_validity import valid_of
@@ -104,3 +104,13 @@ def test_a_recording_leaves_it_out_and_says_so(tmp_path: Path) -> None:
     assert not valid[BODY].any()
     assert description["robots"]["alpha"]["body_share"] == pytest.approx(float(np.mean(~valid)))
     assert "keep their depth while the camera moves" in description["warnings"][0]
+
+
+@pytest.mark.filterwarnings("ignore:All-NaN slice")
+def test_percentiles_are_those_of_every_pixel_alone() -> None:
+    rng = np.random.default_rng(0)
+    depth = rng.integers(1, 9000, (31, 12, 16)).astype(np.float32)
+    depth[rng.random(depth.shape) < rng.random((12, 16))] = np.nan
+    depth[:, 0, :3] = np.nan
+    depth[1:, 1, 0] = np.nan
+    np.testing.assert_array_equal(percentiles(depth), np.nanpercentile(depth, [10, 50, 90], axis=0))
