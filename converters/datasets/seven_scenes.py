@@ -21,7 +21,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from duagc.converters.layouts import reference_poses
 from duagc.converters.layouts.calibrated import ColorLens, correct, numbers, resampled
 from duagc.converters.layouts.displaced_depth import DepthRegistration
-from duagc.converters.layouts.image_files import options_of, read_color, read_depth, rigid
+from duagc.converters.layouts.image_files import kept_color, options_of, read_color, read_depth, rigid
 from duagc.converters.layouts.self_check import ReprojectionCheck
 from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
@@ -293,8 +293,9 @@ def _write_robot(
 
     def images(files: SevenScenesFrame) -> tuple[bytes, str, Depth]:
         depth = register(correct(_depth_m(files.depth), options.depth_camera(), correction))
-        color, color_format, image = read_color(files.color, (WIDTH, HEIGHT))
-        return (color, color_format, depth) if maps is None else (resampled(image, maps), "png", depth)
+        if maps is None:
+            return *kept_color(files.color, (WIDTH, HEIGHT)), depth
+        return resampled(read_color(files.color, (WIDTH, HEIGHT)), maps), "png", depth
 
     found = zip(frames, in_order(images, frames), strict=True)
     titled = track(found, f"convert {robot.name}", total=len(frames))
@@ -333,8 +334,8 @@ def _count_holes(depth: NDArray[np.uint16]) -> int:
 
 def _depth_m(path: Path) -> Depth:
     """Depth [480, 640] in meters, 0 where there is none."""
-    raw = read_depth(path, (WIDTH, HEIGHT), "depth in millimeters")
-    return np.where(np.isin(raw, NO_DEPTH), 0, raw) * DEPTH_SCALE
+    raw = read_depth(path, (WIDTH, HEIGHT), "depth in millimeters", NO_DEPTH)
+    return raw.astype(np.float64) * DEPTH_SCALE
 
 
 def _read_pose(path: Path) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from duagc.converters.layouts.ros_images import encoded_size
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import decode_image, read_bytes
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import se3, so3
 
+COLOR = "a color image"
+PNG, JPEG = b"\x89PNG", b"\xff\xd8\xff"  # the first bytes
 MAX_ROTATION_DEFECT = 0.01  # largest entry of |R - nearest rotation|
 Options = TypeVar("Options", bound=Config)
 
@@ -36,30 +39,53 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of a color image."""
     import cv2
 
-    image = decode_image(read_bytes(path, "a color image"), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode_image(read_bytes(path, COLOR), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DuagError(f"{path}: no decoder reads it, expected a color image")
     return int(image.shape[1]), int(image.shape[0])
 
 
-def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str, NDArray[np.uint8]]:
-    """A color image of `size` (width, height): its bytes as they are, their format, and BGR [H, W, 3]."""
+def read_color(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """A color image of `size` (width, height), BGR [H, W, 3]."""
+    return _whole_color(path, read_bytes(path, COLOR), size)
+
+
+def kept_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str]:
+    """The bytes of a color image of `size` (width, height), which a decoder reads, and their format."""
     import cv2
 
-    data = read_bytes(path, "a color image")
+    data = read_bytes(path, COLOR)
+    # at an eighth of its size a JPEG takes half the time, and the same is wrong with it
+    flags = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
+    is_jpeg = data.startswith(JPEG) and encoded_size(data) == size
+    if not is_jpeg or decode_image(data, flags) is None:
+        _whole_color(path, data, size)
+    return data, "jpeg" if data.startswith(JPEG) else "png"
+
+
+def _whole_color(path: Path, data: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
+    import cv2
+
     image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a color image")
     check_size(path, image.shape, size)
-    if data.startswith(b"\x89PNG"):
-        return data, "png", image
-    if data.startswith(b"\xff\xd8\xff"):
-        return data, "jpeg", image
-    raise DuagError(f"{path}: is neither JPEG nor PNG, expected one of them")
+    if not data.startswith((PNG, JPEG)):
+        raise DuagError(f"{path}: is neither JPEG nor PNG, expected one of them")
+    return np.asarray(image, dtype=np.uint8)
 
 
-def read_depth(path: Path, size: tuple[int, int], unit: str = "depth") -> NDArray[np.uint16]:
-    """A 16-bit depth image [H, W] of `size` (width, height), in the units of its file."""
+def read_depth(
+    path: Path, size: tuple[int, int], unit: str = "depth", no_depth: Sequence[int] = ()
+) -> NDArray[np.uint16]:
+    """A 16-bit depth image [H, W], in the units of its file.
+
+    Args:
+        path: of the file.
+        size: width and height that it should have.
+        unit: what an error calls its values.
+        no_depth: values that mean none, which become 0.
+    """
     import cv2
 
     data = read_bytes(path, "a depth image")
@@ -69,7 +95,11 @@ def read_depth(path: Path, size: tuple[int, int], unit: str = "depth") -> NDArra
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise DuagError(f"{path}: is {raw.dtype} with {raw.ndim} axes, expected 16-bit {unit}")
     check_size(path, raw.shape, size)
-    return np.asarray(raw, dtype=np.uint16)
+    depth = np.asarray(raw, dtype=np.uint16)
+    for value in no_depth:
+        if value:
+            depth[depth == value] = 0
+    return depth
 
 
 def check_size(path: Path, shape: tuple[int, ...], size: tuple[int, int]) -> None:

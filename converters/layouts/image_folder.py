@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.layouts.image_files import read_color, read_depth
+from duagc.converters.layouts.image_files import kept_color, read_color, read_depth
 from duagc.converters.layouts.self_check import ReprojectionCheck
 from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
@@ -175,8 +175,7 @@ def _unmeasured(clip: Clip) -> tuple[int, float]:
     files = list(dict.fromkeys(frame.depth for frame in clip.frames if frame.depth is not None))
     some = files[: LOOKED_AT_EVERY * LOOKED_AT : LOOKED_AT_EVERY]
     size = clip.camera.width, clip.camera.height
-    images = [read_depth(path, size) for path in some]
-    greatest, share = unmeasured([np.where(np.isin(raw, clip.no_depth), 0, raw) for raw in images])
+    greatest, share = unmeasured([read_depth(path, size, no_depth=clip.no_depth) for path in some])
     return int(greatest), share
 
 
@@ -192,8 +191,7 @@ def _write_clip(robot: RobotWriter, clip: Clip, lens: _Lens, label: str) -> dict
         files, new_depth = task
         raw = None
         if new_depth and files.depth is not None:
-            raw = read_depth(files.depth, size)
-            raw = lens.depth(np.where(np.isin(raw, clip.no_depth), 0, raw).astype(np.uint16))
+            raw = lens.depth(read_depth(files.depth, size, no_depth=clip.no_depth))
         return *lens.color(files.color), raw
 
     tasks = list(zip(clip.frames, _with_new_depth(clip.frames), strict=True))
@@ -270,10 +268,9 @@ class _Lens:
         """Encoded color: the file's own bytes, or a PNG of what was resampled."""
         import cv2
 
-        data, color_format, image = read_color(path, self._size)
         if self._maps is None:
-            return data, color_format
-        moved = cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
+            return kept_color(path, self._size)
+        moved = cv2.remap(read_color(path, self._size), *self._maps, cv2.INTER_LINEAR)
         return cv2.imencode(".png", moved)[1].tobytes(), "png"
 
 
