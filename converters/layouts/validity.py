@@ -71,7 +71,8 @@ class BlackBorder:
         image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             return  # reading the recording will complain
-        value = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2])  # ten times as fast as max(axis=2)
+        blue, green, red = image[..., 0], image[..., 1], image[..., 2]
+        value = np.maximum(np.maximum(blue, green), red)  # ten times as fast as max(axis=2)
         if np.percentile(value, BRIGHT_PERCENT) > BRIGHT and (
             self._brightest is None or value.shape == self._brightest.shape
         ):
