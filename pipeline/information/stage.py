@@ -23,7 +23,8 @@ from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
-from duagc.pipeline.information.deviation import DepthView, surface_deviation
+from duagc.pipeline.geometry.surface_distance import DepthView
+from duagc.pipeline.information.deviation import surface_deviation
 from duagc.pipeline.information.noise import estimate_noise, with_correlation
 from duagc.pipeline.information.sums import sum_information, without_thickness
 from duagc.pipeline.information.views import MapViews, free_space, usable_depth, without_moving

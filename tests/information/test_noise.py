@@ -10,7 +10,8 @@ from duagc.pipeline.base import row_blocks
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.information.deviation import DepthView, surface_deviation
+from duagc.pipeline.geometry.surface_distance import DepthView
+from duagc.pipeline.information.deviation import surface_deviation
 from duagc.pipeline.information.noise import ImageNoise, estimate_noise, with_correlation
 from duagc.pipeline.information.sums import sum_information
 from duagc.pipeline.information.views import MapViews
