@@ -69,6 +69,22 @@ class PeerValidationConfig(Config):
     """Matched Gaussians may differ by this many times tau_G of the own map."""
 
 
+class StatedScaleConfig(Config):
+    """The factor on the stated deviations of a fused map, at least 1: peers' Gaussians held against own depth."""
+
+    enabled: bool = True
+    """Else deviations stay as each robot states them of its own Gaussians."""
+    gate_m: float = Field(default=0.1, gt=0.0)
+    """A surface measured farther than this from a Gaussian is another one's."""
+    min_views: int = Field(default=3, ge=1)
+    """Own depth images that must have measured a surface near a Gaussian."""
+    min_gaussians: int = Field(default=100, ge=1)
+    """Such Gaussians, of all peers together, that are needed; with fewer the factor is 1."""
+    share: float = Field(default=0.9, gt=0.0, lt=1.0)
+    """Of the ratios of distance to stated deviation, the share whose quantile is compared with that of normal errors;
+    the largest ratios are of other surfaces behind the Gaussians."""
+
+
 class FusionConfig(Config):
     """From evidence to a robot's fused map."""
 
@@ -116,6 +132,7 @@ class FusionConfig(Config):
     added_need_information: bool = True
     """Import only Gaussians with information on their position."""
     peer_validation: PeerValidationConfig = PeerValidationConfig()
+    stated_scale: StatedScaleConfig = StatedScaleConfig()
     finetune: FinetuneConfig = FinetuneConfig()
     max_added: int | None = Field(default=None, ge=0)
     """Most Gaussians of peers that are imported, those of most position information first."""

@@ -157,6 +157,12 @@ def evaluate(
     return metrics
 
 
+def _stated_scale(robot: RobotRun) -> float:
+    """The factor on stated deviations of the fused map; 1 where it states none."""
+    information = robot.fused_map.information
+    return 1.0 if information is None else information.stated_scale
+
+
 # --- trajectories ------------------------------------------------------------------------------------------------
 
 
@@ -168,6 +174,7 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
         "keyframes": len(robot.keyframes),
         "gaussians": len(robot.own_map.gaussians),
         "gaussians_fused": len(robot.fused_map.gaussians),
+        "stated_scale": _stated_scale(robot),
         "robots_in_component": len(robot.component),
     }
     if isinstance(after, Absent) or isinstance(before, Absent):

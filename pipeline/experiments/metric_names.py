@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from duagc.pipeline.base.errors import DuagError, closest
 
 _ROBOT = (
-    "frames tracked keyframes gaussians gaussians_fused robots_in_component rpe_trans_m rpe_rot_rad "
+    "frames tracked keyframes gaussians gaussians_fused stated_scale robots_in_component rpe_trans_m rpe_rot_rad "
     "ate_rmse_m ate_rmse_m_before_consensus ate_rmse_m_keyframes ate_rmse_m_joint frames_with_truth "
     "depth_agreement_m feature_agreement_px depth_agreement_m_before_consensus "
     "feature_agreement_px_before_consensus depth_agreement_m_of_truth feature_agreement_px_of_truth"

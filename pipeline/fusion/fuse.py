@@ -61,6 +61,7 @@ class FusedMap:
         matched: own Gaussians fused with others.
         added: imported Gaussians.
         colors: from every other robot's colors to the receiver's, which are those of the map.
+        stated_scale: factor on the standard deviations of positions that the information states.
     """
 
     gaussians: Gaussians
@@ -73,6 +74,7 @@ class FusedMap:
     matched: int
     added: int
     colors: dict[str, ColorMap]
+    stated_scale: float = 1.0
 
 
 @dataclass(frozen=True)

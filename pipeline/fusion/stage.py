@@ -26,7 +26,9 @@ from duagc.pipeline.fusion.most_drawn import most_drawn
 from duagc.pipeline.fusion.opacity_update import update_opacities
 from duagc.pipeline.fusion.peer_validation import PeerCheck, ValidatedPeers, validate_peer_maps
 from duagc.pipeline.fusion.peer_views import peer_views
+from duagc.pipeline.fusion.stated_scale import stated_scale
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
+from duagc.pipeline.geometry.surface_distance import DepthView
 from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
     WORLD_FRAME,
@@ -46,6 +48,7 @@ from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult,
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import (
     COLOR_INFORMATION,
+    MEAN_INFORMATION,
     OPACITY_INFORMATION,
     geometry_of_information,
 )
@@ -188,7 +191,12 @@ def _untrained(
         color_sigma=own.information.color_sigma,
         pixels_per_sample=own.information.color_pixels_per_sample,
     )
-    return valid, fused
+    stated = context.config.stated_scale
+    if not stated.enabled:
+        return valid, fused
+    used = (e.select(~valid.contradicted[name]) for name, e in sorted(valid.evidence.items()))
+    seen = ShelvedList(DepthView(_unmasked(view), view.T_world_camera) for view in views)
+    return valid, replace(fused, stated_scale=stated_scale(used, own.camera, seen, stated))
 
 
 def _finetuned(
@@ -290,6 +298,11 @@ def training_views(
     return ShelvedList(replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views)
 
 
+def _unmasked(view: PosedRgbd) -> NDArray[np.float32]:
+    """Depth where the view may be used, else 0."""
+    return view.depth_m if view.mask is None else np.where(view.mask, view.depth_m, np.float32(0))
+
+
 def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:
     for keyframe in range(own.keyframes):
         yield keyframe, own.images(keyframe).depth_m
@@ -364,13 +377,15 @@ def _report(robot: str, check: PeerCheck, stamp_ns: int) -> PeerMapReport:
 
 def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformation:
     """The summed information of the fused Gaussians as a message; no cross terms between mean and covariance."""
+    stated = fused.information.copy()
+    stated[:, MEAN_INFORMATION] /= fused.stated_scale**2
     return GaussianInformation(
         stamp_ns=stamp_ns,
         robot=robot,
         kind=FUSED_KIND,
         window="sum over the robots whose evidence was fused; observations count those robots",
         ids=fused.gaussians.ids,
-        geometry=geometry_of_information(fused.information).astype(np.float32),
+        geometry=geometry_of_information(stated).astype(np.float32),
         color=fused.information[:, COLOR_INFORMATION].astype(np.float32),
         opacity=fused.information[:, OPACITY_INFORMATION].astype(np.float32),
         observations=fused.members.astype(np.uint32),
@@ -380,5 +395,6 @@ def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformat
         color_pixels_per_sample=1.0,
         depth_pixels_per_sample=1.0,
         overlap=1.0,
+        stated_scale=fused.stated_scale,
         frame_id=WORLD_FRAME,
     )

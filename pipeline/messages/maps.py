@@ -108,7 +108,8 @@ class GaussianInformation:
     deviation_m: float32 [n], how far the mean is from the surface that the robot's depth images measured; the sums
     hold everything but one Gaussian fixed and do not know of it. color_pixels_per_sample, depth_pixels_per_sample:
     pixels that say together what one would say alone, because their residuals are alike; the sums are divided by them.
-    overlap: Gaussians drawn in a pixel, mean over the views.
+    overlap: Gaussians drawn in a pixel, mean over the views. stated_scale: factor on the standard deviations of
+    positions that is in `geometry`, by peers' Gaussians and own depth images; 1 where nothing says any.
     """
 
     schema: ClassVar[str] = "duagc.v1.GaussianInformation"
@@ -128,6 +129,7 @@ class GaussianInformation:
     color_pixels_per_sample: float
     depth_pixels_per_sample: float
     overlap: float
+    stated_scale: float = 1.0
     frame_id: str = ""  # empty: the robot's map
 
     def __post_init__(self) -> None:
@@ -161,6 +163,7 @@ class GaussianInformation:
             color_pixels_per_sample=float(self.color_pixels_per_sample),
             depth_pixels_per_sample=float(self.depth_pixels_per_sample),
             overlap=float(self.overlap),
+            stated_scale=float(self.stated_scale),
         )
         pack_stamp(message, self.stamp_ns)
         return message
@@ -188,6 +191,7 @@ class GaussianInformation:
             color_pixels_per_sample=m.color_pixels_per_sample,
             depth_pixels_per_sample=m.depth_pixels_per_sample,
             overlap=m.overlap,
+            stated_scale=m.stated_scale or 1.0,  # 0 in older logs
             frame_id=m.frame_id,
         )
 

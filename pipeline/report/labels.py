@@ -73,6 +73,7 @@ ROBOT = {
     "keyframes": ("Keyframes", "frames that carry the map"),
     "gaussians": ("Own Gaussians", "Gaussians in the robot's own map"),
     "gaussians_fused": ("Fused Gaussians", "Gaussians in the robot's map after fusion"),
+    "stated_scale": ("Factor on σ", "on stated deviations of positions, by peers' Gaussians and own depth images"),
     "ate_rmse_m_before_consensus": ("ATE before", "position error of the front end alone, own alignment, all frames"),
     "ate_rmse_m": ("ATE after", "position error after consensus, own alignment, all frames"),
     "ate_rmse_m_joint": ("ATE, joint", "position error after consensus under the alignment that the whole team shares"),

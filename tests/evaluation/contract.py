@@ -6,7 +6,7 @@ from duagc.pipeline.evaluation.results import reason_of
 
 NUMBER = (int, float)
 ROBOT = {
-    "frames": int, "tracked": int, "keyframes": int, "gaussians": int, "gaussians_fused": int,
+    "frames": int, "tracked": int, "keyframes": int, "gaussians": int, "gaussians_fused": int, "stated_scale": float,
     "robots_in_component": int, "frames_with_truth": int, "ate_rmse_m": NUMBER,
     "ate_rmse_m_before_consensus": NUMBER, "ate_rmse_m_keyframes": NUMBER, "ate_rmse_m_joint": NUMBER,
     "rpe_trans_m": NUMBER, "rpe_rot_rad": NUMBER, "depth_agreement_pairs": int, "depth_agreement_m": NUMBER,
