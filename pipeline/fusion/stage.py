@@ -195,7 +195,7 @@ def _untrained(
     if not stated.enabled:
         return valid, fused
     used = (e.select(~valid.contradicted[name]) for name, e in sorted(valid.evidence.items()))
-    seen = ShelvedList(DepthView(_unmasked(view), view.T_world_camera) for view in views)
+    seen = ShelvedList(DepthView(view.usable_depth, view.T_world_camera) for view in views)
     return valid, replace(fused, stated_scale=stated_scale(used, own.camera, seen, stated))
 
 
@@ -296,11 +296,6 @@ def training_views(
 
         views = ShelvedList(map(posed, (*first, *between)))
     return ShelvedList(replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views)
-
-
-def _unmasked(view: PosedRgbd) -> NDArray[np.float32]:
-    """Depth where the view may be used, else 0."""
-    return view.depth_m if view.mask is None else np.where(view.mask, view.depth_m, np.float32(0))
 
 
 def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:

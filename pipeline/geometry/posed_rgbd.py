@@ -37,3 +37,8 @@ class PosedRgbd:
     def unit_color(self) -> NDArray[np.float32]:
         """float32 [H, W, 3], RGB in the colors of the map, 0..1 and above."""
         return unit_color(self.color, self.exposure)
+
+    @property
+    def usable_depth(self) -> NDArray[np.float32]:
+        """Depth [H, W] where the mask allows; 0 elsewhere."""
+        return self.depth_m if self.mask is None else np.where(self.mask, self.depth_m, np.float32(0))

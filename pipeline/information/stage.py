@@ -27,7 +27,7 @@ from duagc.pipeline.geometry.surface_distance import DepthView
 from duagc.pipeline.information.deviation import surface_deviation
 from duagc.pipeline.information.noise import estimate_noise, with_correlation
 from duagc.pipeline.information.sums import sum_information, without_thickness
-from duagc.pipeline.information.views import MapViews, free_space, usable_depth, without_moving
+from duagc.pipeline.information.views import MapViews, free_space, without_moving
 from duagc.pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
 from duagc.pipeline.recording import LogWriter, RgbdLog, open_rgbd, read_exposures, read_log
 from duagc.pipeline.registration.moving import FreeSpace
@@ -66,7 +66,7 @@ def run_information(
             raise DuagError(f"{frontend_path}: has the map of {final.robot}, expected that of {log.robot}")
         views, free = own_views(log, front, frontend_path, moving, threads=threads)
         seen = chain(
-            (DepthView(usable_depth(image), image.T_world_camera) for image in views.images),
+            (DepthView(image.usable_depth, image.T_world_camera) for image in views.images),
             _depth_views(log, front.between(config.deviation_frames), free),
         )
         deviation_m = surface_deviation(final.gaussians, log.camera, seen, config.deviation_gate_m)

@@ -54,20 +54,13 @@ def free_space(images: Sequence[PosedRgbd], camera: PinholeCamera, config: Movin
     """Space that the images saw to be free."""
     free = FreeSpace(camera, config)
     for image in images:
-        free.add(usable_depth(image), image.T_world_camera)
+        free.add(image.usable_depth, image.T_world_camera)
     return free
 
 
 def without_moving(images: Sequence[PosedRgbd], free: FreeSpace) -> ShelvedList[PosedRgbd]:
     """The images with what moved masked, as the front end did before it mapped them."""
     return ShelvedList(
-        replace(image, mask=free.usable(usable_depth(image), image.T_world_camera, image.mask))
+        replace(image, mask=free.usable(image.usable_depth, image.T_world_camera, image.mask))
         for image in images
     )
-
-
-def usable_depth(image: PosedRgbd) -> NDArray[np.float32]:
-    """The depth of an image, 0 also where its mask forbids the pixel."""
-    if image.mask is None:
-        return image.depth_m
-    return np.where(image.mask, image.depth_m, np.float32(0))
