@@ -157,12 +157,6 @@ def evaluate(
     return metrics
 
 
-def _stated_scale(robot: RobotRun) -> float:
-    """The factor on stated deviations of the fused map; 1 where it states none."""
-    information = robot.fused_map.information
-    return 1.0 if information is None else information.stated_scale
-
-
 # --- trajectories ------------------------------------------------------------------------------------------------
 
 
@@ -194,6 +188,12 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
         "rpe_rot_rad": rpe_rot_rad,
         "frames_with_truth": len(after),
     }
+
+
+def _stated_scale(robot: RobotRun) -> float:
+    """The factor on stated deviations of the fused map; 1 where it states none."""
+    information = robot.fused_map.information
+    return 1.0 if information is None else information.stated_scale
 
 
 def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:

@@ -102,6 +102,11 @@ class ValidatedPeers:
     rejected: dict[tuple[str, str], Index]
     checks: tuple[PeerCheck, ...]
 
+    @property
+    def uncontradicted(self) -> dict[str, Evidence]:
+        """By name, in order, the evidence without what own images contradict."""
+        return {name: e.select(~self.contradicted[name]) for name, e in sorted(self.evidence.items())}
+
 
 def validate_peer_maps(
     own: Evidence,

@@ -157,7 +157,7 @@ def _fuse(
 def _untrained(
     own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], context: MapContext
 ) -> tuple[ValidatedPeers, FusedMap]:
-    """Validate the peers' maps, fuse, update opacities."""
+    """Validate the peers' maps, fuse, update opacities, and hold the peers' deviations against own images."""
     poses, keyframe_views = result.T_world_keyframe_of, views[: own.keyframes]
     mine = SHELF.put(in_world(result.own_evidence, poses[own.robot], context.weights))
     valid = validate_peer_maps(
@@ -191,12 +191,13 @@ def _untrained(
         color_sigma=own.information.color_sigma,
         pixels_per_sample=own.information.color_pixels_per_sample,
     )
-    stated = context.config.stated_scale
-    if not stated.enabled:
+    if not context.config.stated_scale.enabled:
         return valid, fused
-    used = (e.select(~valid.contradicted[name]) for name, e in sorted(valid.evidence.items()))
     seen = ShelvedList(DepthView(view.usable_depth, view.T_world_camera) for view in views)
-    return valid, replace(fused, stated_scale=stated_scale(used, own.camera, seen, stated))
+    peers = valid.uncontradicted.values()
+    return valid, replace(
+        fused, stated_scale=stated_scale(peers, own.camera, seen, context.config.stated_scale)
+    )
 
 
 def _finetuned(
@@ -216,7 +217,7 @@ def _finetuned(
     shown: Sequence[PosedRgbd] = ()
     begun, poses = fused.gaussians, result.T_world_keyframe_of
     if config.peer_share:
-        usable = {name: e.select(~valid.contradicted[name]) for name, e in valid.evidence.items()}
+        usable = valid.uncontradicted
         shown = peer_views(
             usable,
             poses,

@@ -47,7 +47,8 @@ def _ratios(
 ) -> Array:
     """|distance| / sigma along the normals of the Gaussians that enough views measured a surface near."""
     counts, off_m = median_distances(peer.theta[:, MEAN], camera, views, config.gate_m)
-    some = peer.select(counts >= config.min_views)
+    seen = counts >= config.min_views
+    some = peer.select(seen)
     normals = gaussians_of(some.ids, some.anchors, some.theta).normals()
     sigma_m, determined = sigma_along(some.position_information(), normals)
-    return np.asarray((np.abs(off_m[counts >= config.min_views]) / sigma_m)[determined])
+    return np.asarray((np.abs(off_m[seen]) / sigma_m)[determined])

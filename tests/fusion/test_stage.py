@@ -11,7 +11,7 @@ import pytest
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import ColorConfig, MapMatching
-from duagc.pipeline.config.fusion import FinetuneConfig, FusionConfig
+from duagc.pipeline.config.fusion import FinetuneConfig, FusionConfig, StatedScaleConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.stage import run_fusion
@@ -213,6 +213,41 @@ def test_what_only_a_neighbor_saw_is_imported(robot, tmp_path):
     assert colors.is_identity
     assert colors.matches == 0
     np.testing.assert_allclose(colors.sigma_gain, np.sqrt(2) * ColorConfig().prior_gain)
+
+
+def test_a_neighbor_far_from_own_images_raises_what_is_stated_of_positions(robot, tmp_path):
+    """Alpha's Gaussians lie 40 mm behind the wall and state 10 mm."""
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, 12), np.linspace(-0.4, 0.4, 10))
+    theta = np.zeros((x.size, 13))
+    theta[:, :3] = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 2.04)])
+    theta[:, 3:9] = [-7.0, -7.0, -12.0, 0, 0, 0]
+    theta[:, 9:12] = 90 / 255
+    information = np.ones((x.size, 31))
+    information[:, :6] = [1e4, 0, 0, 1e4, 0, 1e4]
+    other = Evidence("alpha", np.arange(x.size), np.zeros(x.size), theta, information)
+    still = replace(robot, T_map_camera=np.tile(np.eye(4), (FRAMES, 1, 1)))
+    source = AgentInput("bravo", robot.log, robot.frontend, robot.information, 1e-3)
+    training = FinetuneConfig(steps_per_view=0)
+    maps = []
+    for enabled in (False, True):
+        stated = StatedScaleConfig(enabled=enabled, min_views=2)
+        config = FusionConfig(explained_opacity=0.0, finetune=training, stated_scale=stated)
+        result = result_of(robot, still.T_map_keyframe, alpha=other)
+        run_fusion(source, result, tmp_path, **SETTINGS | {"config": config})
+        (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.FUSED_MAP.of("bravo")])
+        maps.append(record.message())
+    before, after = (m.information for m in maps)
+    assert before.stated_scale == 1.0
+    assert 1.5 < after.stated_scale < 4.0  # 4 standard deviations; some of the errors are those of the poses
+    positions = [0, 1, 2, 9, 10, 17]  # in the upper triangle of 9x9
+    np.testing.assert_allclose(
+        after.stated_scale**2 * after.geometry[:, positions], before.geometry[:, positions], rtol=1e-5
+    )
+    others = np.setdiff1d(np.arange(45), positions)
+    np.testing.assert_array_equal(after.geometry[:, others], before.geometry[:, others])
+    for name in ("color", "opacity", "ids"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    np.testing.assert_array_equal(maps[1].gaussians.means, maps[0].gaussians.means)
 
 
 def test_a_merge_has_no_more_gaussians_than_it_may(robot, tmp_path):

@@ -52,6 +52,7 @@ def gaussian_information(rng: np.random.Generator, n: int) -> m.GaussianInformat
         color_pixels_per_sample=9.5,
         depth_pixels_per_sample=25.0,
         overlap=12.25,
+        stated_scale=1.75,
         frame_id="alpha/map",
     )
 
