@@ -20,17 +20,30 @@ def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) 
     force: replace what is there, if it is empty or of this kind: its name, and the files that mark it.
     """
     _check_out(out, force, kind)
-    partial = out.with_name(out.name + ".part")
+    partial, replaced = (out.with_name(out.name + ending) for ending in (".part", ".replaced.part"))
     with _locked(partial):
         try:
+            _settle(replaced, out)
+            _check_out(out, force, kind)
             yield partial
             _check_out(out, force, kind)  # it may have appeared meanwhile
             if out.exists():
-                shutil.rmtree(out)
+                out.rename(replaced)  # removing takes long: whoever is stopped in it leaves one whole folder
             partial.rename(out)
+            _settle(replaced, out)
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
+
+
+def _settle(replaced: Path, out: Path) -> None:
+    """Remove what was replaced; where the process was stopped before the new folder had its name, put it back."""
+    if not replaced.exists():
+        return
+    if out.exists():
+        shutil.rmtree(replaced)
+    else:
+        replaced.rename(out)
 
 
 @contextmanager

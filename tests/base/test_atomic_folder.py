@@ -1,0 +1,57 @@
+"""Folders that appear whole: whatever stops the process, the old one or the new one is there."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from duagc.pipeline.base import atomic_folder
+from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.errors import DuagError
+
+
+def write(out: Path, text: str) -> None:
+    with new_folder(out, force=True) as folder:
+        (folder / "manifest.json").write_text(text)
+        (folder / "fused.mcap").write_text(text)
+
+
+def content(out: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in out.iterdir()}
+
+
+class Stopped(BaseException):
+    pass
+
+
+def test_a_folder_is_replaced_and_nothing_else_is_left(tmp_path: Path) -> None:
+    write(tmp_path / "run", "old")
+    write(tmp_path / "run", "new")
+    assert content(tmp_path / "run") == {"manifest.json": "new", "fused.mcap": "new"}
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_what_is_stopped_while_it_removes_the_old_one_leaves_the_new_one(tmp_path, monkeypatch) -> None:
+    write(tmp_path / "run", "old")
+
+    def half(folder, **_):
+        (Path(folder) / "fused.mcap").unlink(missing_ok=True)
+        raise Stopped
+
+    monkeypatch.setattr(atomic_folder.shutil, "rmtree", half)
+    with pytest.raises(Stopped):
+        write(tmp_path / "run", "new")
+    monkeypatch.undo()
+    assert content(tmp_path / "run") == {"manifest.json": "new", "fused.mcap": "new"}
+    write(tmp_path / "run", "newer")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_what_is_stopped_between_two_names_gives_the_old_one_back(tmp_path: Path) -> None:
+    write(tmp_path / "run", "old")
+    (tmp_path / "run").rename(tmp_path / "run.replaced.part")
+    with pytest.raises(DuagError, match="exists already"), new_folder(tmp_path / "run", force=False):
+        pytest.fail("there is a run")
+    assert content(tmp_path / "run") == {"manifest.json": "old", "fused.mcap": "old"}
+    shutil.rmtree(tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
