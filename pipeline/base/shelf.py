@@ -6,8 +6,10 @@ when they are looked at. The system takes the pages back now and then. Values st
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
+import resource
 import sys
 import tempfile
 import weakref
@@ -21,6 +23,8 @@ Value = TypeVar("Value")
 ALIGNMENT = 64
 LEAST_BYTES = 64 << 10
 """Objects of less stay in memory."""
+MOST_FILES = 1 << 16
+"""Open files that are asked for, if the system allows so many."""
 SWEEP_AFTER = 16
 """Objects, after which all pages are given back that were looked at since."""
 
@@ -34,6 +38,7 @@ class Shelf:
 
     def __init__(self) -> None:
         """Begin with none."""
+        self._room_for_files = False
         self._mappings: weakref.WeakSet[_Mapping] = weakref.WeakSet()
         self._new = 0
         self._full = False
@@ -78,6 +83,9 @@ class Shelf:
 
     def _written(self, arrays: list[np.ndarray], sizes: list[int]) -> _Mapping | None:
         """A file with the arrays; None if there is no room for it."""
+        if not self._room_for_files:
+            _allow_files()
+            self._room_for_files = True
         try:
             with tempfile.TemporaryFile(prefix="duagc-") as file:
                 for array, size in zip(arrays, sizes, strict=True):
@@ -87,12 +95,21 @@ class Shelf:
                 mapping = _Mapping(file.fileno(), sum(sizes), prot=mmap.PROT_READ)
         except OSError as error:
             self._full = True
-            place = tempfile.gettempdir()
             reason = error.strerror or os.strerror(error.errno or 0)
-            print(f"warning: {place}: {reason}; keyframes stay in memory", file=sys.stderr)
+            if error.errno == errno.EMFILE:
+                reason = f"{reason} ({len(self._mappings)} of keyframes, see `ulimit -Hn`)"
+            print(f"warning: {tempfile.gettempdir()}: {reason}; keyframes stay in memory", file=sys.stderr)
             return None
         self._mappings.add(mapping)
         return mapping
+
+
+def _allow_files() -> None:
+    """Let this process open as many files as the system allows: each mapping holds one, and the usual limit is low."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def _in_memory(value: Any) -> bool:

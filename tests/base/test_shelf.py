@@ -1,5 +1,7 @@
 """Arrays in files: equal, read-only, given back, and in memory where there is no room."""
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -88,3 +90,20 @@ def test_a_list_gives_back_what_was_looked_at() -> None:
         assert _resident_kb() - before < 2.5 * shelf.SWEEP_AFTER * 2000  # of 40 x 2000 kB
     assert [float(value[0][0]) for value in values[30::5]] == [30.0, 35.0]
     assert float(values[-1][0][0]) == 39.0
+
+
+def test_more_objects_fit_than_a_process_may_usually_open() -> None:
+    """In a process of its own, whose limit is low as on most systems."""
+    program = """
+import resource
+import numpy as np
+from duagc.pipeline.base import shelf
+_, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, hard))
+kept = shelf.Shelf()
+values = [kept.put((np.full(10_000, k, np.float64),)) for k in range(200)]
+print(len(kept), sum(int(value[0][7]) for value in values))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["200", str(sum(range(200)))]
+    assert done.stderr == ""
