@@ -24,12 +24,13 @@ from duagc.converters.layouts.ros_images import (
     is_cut_short,
 )
 from duagc.converters.layouts.self_check import GAP, MAX_RATIO, ReprojectionCheck
-from duagc.converters.logs import open_log
+from duagc.converters.logs import Log, open_log
 from duagc.converters.logs.clocks import LEAST_OFFSET_S, angular_speed, compare, lag, overlap_warnings
 from duagc.converters.logs.derived import Picture, Sweeps
+from duagc.converters.logs.describe import namespaces
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
-from duagc.converters.logs.sources import sources_of
+from duagc.converters.logs.sources import Source, sources_of
 from duagc.converters.logs.unmeasured import farthest_measured_m
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter
@@ -75,10 +76,21 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         robot_logs = {}
         for part in sources:
             log = opened.enter_context(open_log(part.paths, part.name))
-            robot_logs[part.robot] = RobotLog(log, part.namespace, part.settings)
+            robot_logs[part.robot] = _robot_log(log, part)
         settle_clocks(recording, robot_logs)
         for part in sources:
             write_robot(recording, part.robot, robot_logs[part.robot], part.label)
+
+
+def _robot_log(log: Log, part: Source) -> RobotLog:
+    """The log of one robot; where topics of several cannot be told apart, the error says how."""
+    try:
+        return RobotLog(log, part.namespace, part.settings)
+    except DuagError as error:
+        spaces = [] if part.namespace else namespaces(log)
+        if not spaces:
+            raise
+        raise DuagError(f"{error}, or --set namespaces={','.join(spaces)} if each is a robot") from error
 
 
 def settle_clocks(recording: RecordingWriter, robot_logs: Mapping[str, RobotLog]) -> None:

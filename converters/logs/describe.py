@@ -60,11 +60,13 @@ def describe(src: Path) -> dict[str, Any]:
     sources = list(_robots(src))
     clocks = []
     with ExitStack() as opened:
-        for source in sources:
+        for source, spaces in sources:
             log = opened.enter_context(open_log(source.paths, source.name))
             if log.name not in logs:
                 logs[log.name] = _log(log)
             robot_log, robots[source.robot] = _robot(log, source)
+            if spaces:
+                robots[source.robot]["by_namespace"] = spaces
             if robot_log:
                 if robot_log.drift is not None:
                     robots[source.robot]["drift_ppm"] = 1e6 * robot_log.drift.rate
@@ -81,15 +83,15 @@ def describe(src: Path) -> dict[str, Any]:
     }
 
 
-def _robots(src: Path) -> Iterator[Source]:
-    """The robots that a conversion would find, and those that namespaces would tell apart."""
+def _robots(src: Path) -> Iterator[tuple[Source, str]]:
+    """The robots that a conversion would find, and those that namespaces would tell apart, with these namespaces."""
     for source in sources_of(src, {}):
         with open_log(source.paths, source.name) as log:
             spaces = [] if src.suffix == ".toml" else namespaces(log)
         for space in spaces:
-            yield replace(source, robot=robot_of(space), namespace=space)
+            yield replace(source, robot=robot_of(space), namespace=space), ",".join(spaces)
         if not spaces:
-            yield source
+            yield source, ""
 
 
 def namespaces(log: Log) -> list[str]:
@@ -241,6 +243,8 @@ def _log_lines(name: str, log: Mapping[str, Any]) -> list[str]:
 def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
     space = f" below {row['namespace']}" if row["namespace"] else ""
     lines = [f"robot {robot}: {row['log']}{space}"]
+    if row.get("by_namespace"):
+        lines.append(f"  one of several in the log; convert by --set namespaces={row['by_namespace']}")
     for option, choice in row.get("choices", {}).items():
         lines.append(f"  {option:<10}  {choice['topic'] or 'not decided'}: {choice['why']}")
     if row["problem"]:

@@ -81,6 +81,7 @@ def test_namespaces_that_decide_become_robots(tmp_path: Path) -> None:
     log = r.write(tmp_path / "bag", sorted(jackal + husky, key=lambda x: x[1]), "mcap")
     shown = run.invoke(app, ["info", str(log)]).stdout
     assert "robot husky" in shown
+    assert "convert by --set namespaces=/husky,/jackal" in shown
     assert "clock       add -3.250000 s (one recorder)" in shown  # jackal's, on the clock of husky
     assert "warning: jackal: its times" in shown
     (tmp_path / "team.toml").write_text(run.invoke(app, ["info", str(log), "--toml"]).stdout)
