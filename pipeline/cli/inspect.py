@@ -1,4 +1,4 @@
-"""Commands that show what happened in a run."""
+"""Commands that show what happened in a run, and hand its maps to other programs."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from duagc.pipeline.cli.common import Json, app
+from duagc.pipeline.cli.common import Force, Json, Out, app, say
 
 
 @app.command()
@@ -22,6 +22,47 @@ def view(
     from duagc.pipeline.viewing import rerun_view
 
     rerun_view.view(path, save=save, screenshot=screenshot)
+
+
+@app.command()
+def export(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)],
+    out: Out,
+    points: Annotated[
+        bool,
+        typer.Option(
+            "--points", help="A point cloud with normals, opacity and sigma_m in place of Gaussian splats."
+        ),
+    ] = False,
+    tile: Annotated[
+        float | None,
+        typer.Option(metavar="METERS", help="Cut each map into cubes of this edge.", show_default=False),
+    ] = None,
+    robots: Annotated[
+        list[str] | None,
+        typer.Option("--robot", help="Whose map; repeatable. Default: all robots.", show_default=False),
+    ] = None,
+    min_opacity: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="With --points: leave out Gaussians below it.")
+    ] = 0.5,
+    force: Force = False,
+) -> None:
+    """Write each robot's final map as .ply for splat viewers, or as a point cloud; whole or in tiles.
+
+    The folder has export.json, which says what every file holds and where it is.
+
+    Examples:
+    `duagc export outputs/demo/run --points --robot alpha --out outputs/cloud`,
+    `duagc export outputs/house --tile 5 --out outputs/house_tiles`
+    """
+    from duagc.pipeline.viewing.map_export import ExportPlan
+    from duagc.pipeline.viewing.map_export import export as export_maps
+
+    plan = ExportPlan("points" if points else "splats", tile, tuple(robots or ()), min_opacity)
+    files = export_maps(run_folder, out, plan, force=force)
+    size_mb = sum(path.stat().st_size for path in files) / 1e6
+    say(f"{len(files)} file{'s' * (len(files) != 1)}, {size_mb:.1f} MB")
+    print(out)
 
 
 @app.command()
