@@ -13,15 +13,6 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.other_trackers import Open3dTrackerConfig, RenderingTrackerConfig
 from duagc.pipeline.config.registration import GeometricVerificationConfig, MovingConfig, RegistrationConfig
 
-# Not settings: the files of a run and their readers promise this rule.
-HELD_OUT_PERIOD = 8
-HELD_OUT_OFFSET = 4
-
-
-def is_held_out(frame_index: int) -> bool:
-    """Whether a frame is kept for evaluation: tracked, but never a keyframe and never mapped."""
-    return frame_index % HELD_OUT_PERIOD == HELD_OUT_OFFSET
-
 
 class LoopConfig(GeometricVerificationConfig):
     """Loop closures within the robot's own path."""

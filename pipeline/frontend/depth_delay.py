@@ -18,7 +18,8 @@ from itertools import pairwise
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.config.frontend import DelayConfig, is_held_out
+from duagc.pipeline.base.held_out import is_held_out
+from duagc.pipeline.config.frontend import DelayConfig
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.frontend.frame_images import pyramid_of
 from duagc.pipeline.geometry import se3

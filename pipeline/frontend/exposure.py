@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.exposure import ExposureConfig
-from duagc.pipeline.config.frontend import is_held_out
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import projection, se3

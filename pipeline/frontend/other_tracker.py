@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.shelf import SHELF
-from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.other_trackers import StatedInformationConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.config.frontend import is_held_out
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes

@@ -19,6 +19,7 @@ from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.frontend import FrontendConfig
@@ -356,7 +357,7 @@ class _ComponentStage:
 
 
 def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
-    """Noise of the depth images, meters: the median over the frames of the depth residual of their registration.
+    """Noise of the depth images, meters: the median depth residual of registration over frames that are not held out.
 
     Args:
         frames: of the log, as tracked.
@@ -367,6 +368,9 @@ def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
     rms_m = [
         frame.rms_depth_m
         for frame in frames
-        if frame.status is Status.OK and frame.reason is Reason.NONE and frame.rms_depth_m > 0
+        if frame.status is Status.OK
+        and frame.reason is Reason.NONE
+        and frame.rms_depth_m > 0
+        and not is_held_out(frame.frame_index)
     ]
     return float(np.median(rms_m)) if rms_m else None

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.base.held_out import is_held_out
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, tracked_path
 from duagc.pipeline.frontend.view_gain import ViewGain

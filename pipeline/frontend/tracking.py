@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.base.held_out import is_held_out
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.failure import Reason, saturated_share
 from duagc.pipeline.frontend.frame_images import Image, RgbdImages

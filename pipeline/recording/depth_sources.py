@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.recording.depth_steps import COARSE_PER_M, inverse_step_per_m, without_steps
@@ -135,7 +136,9 @@ class _Steps:
     @cached_property
     def _step_per_m(self) -> float:
         entries = self._log.entries(self._topic)
-        some = [entries[k] for k in evenly_spaced(len(entries), min(STEP_IMAGES, len(entries)))]
+        # a depth image is that of the frame of its number, or of one near it
+        mapped = [entry for k, entry in enumerate(entries) if not is_held_out(k)]
+        some = [mapped[k] for k in evenly_spaced(len(mapped), min(STEP_IMAGES, len(mapped)))]
         records = [self._log.record_at(self._topic, entry) for entry in some]
         return inverse_step_per_m([_depth_image(r, self._scale, self._camera) for r in records], self._scale)
 

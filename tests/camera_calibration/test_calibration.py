@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from duagc.converters.datasets import seven_scenes
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.camera_calibration import report
 from duagc.pipeline.camera_calibration.adjustment import (
     Quality,
@@ -36,7 +37,7 @@ from duagc.pipeline.camera_calibration.views import (
 )
 from duagc.pipeline.cli import app
 from duagc.pipeline.config.calibration import CalibrationConfig
-from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, RgbdFrame, RgbdLog

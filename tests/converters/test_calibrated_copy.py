@@ -15,7 +15,7 @@ from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.frontend import is_held_out
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry import depth_error, se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import LogWriter, Recording, RgbdFrame, open_rgbd, read_log

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.exposure import ExposureConfig
-from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
+from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.evaluation.image_metrics import psnr

@@ -14,8 +14,9 @@ import pytest
 
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.base import load_config
-from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.packages import NO_OPEN3D, check_packages
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.frontend.failure import Reason

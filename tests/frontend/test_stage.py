@@ -284,9 +284,11 @@ def test_what_moves_is_not_mapped(tmp_path: Path) -> None:
 
 
 def test_noise_of_depth_is_that_of_frames_which_were_registered_by_it() -> None:
-    def frame(rms_m: float, status: Status = Status.OK, reason: Reason = Reason.NONE) -> TrackedFrame:
+    def frame(
+        rms_m: float, status: Status = Status.OK, reason: Reason = Reason.NONE, *, index: int = 0
+    ) -> TrackedFrame:
         return TrackedFrame(
-            frame_index=0,
+            frame_index=index,
             stamp_ns=0,
             keyframe_index=0,
             T_keyframe_camera=np.eye(4),
@@ -302,3 +304,5 @@ def test_noise_of_depth_is_that_of_frames_which_were_registered_by_it() -> None:
     color_only = frame(0.5, reason=Reason.FROZEN_DEPTH)
     assert depth_noise_m([first, frame(0.006), lost, color_only, frame(0.008), frame(0.007)]) == 0.007
     assert depth_noise_m([first, lost]) is None
+    held_out = [frame(0.5, index=k) for k in (4, 12, 20)]
+    assert depth_noise_m([frame(0.006), frame(0.007, index=5), *held_out, frame(0.008, index=6)]) == 0.007

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
+from duagc.pipeline.base.held_out import is_held_out
+from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame

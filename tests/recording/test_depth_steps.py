@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from duagc.converters.simulate.sensors.noise import quantized
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.recording import depth_sources, open_rgbd
 from duagc.pipeline.recording.depth_steps import COARSE_PER_M, inverse_step_per_m, without_steps
 from tests.fixtures.recording_logs import png, write_camera
 
@@ -88,3 +89,24 @@ def test_a_log_is_read_without_coarse_steps(tmp_path: Path, step: float, smoothe
     expected = without_steps(seen, inverse_step_per_m([seen], 0.001)) if smoothed else seen
     np.testing.assert_array_equal(found, expected)
     assert np.array_equal(found, seen) != smoothed
+
+
+@pytest.mark.parametrize("images", [1, 5, 40, 200, 1000])
+def test_images_of_held_out_frames_say_nothing_of_steps(monkeypatch: pytest.MonkeyPatch, images: int) -> None:
+    looked_at: list[int] = []
+
+    class Log:
+        def entries(self, _topic: str) -> list[int]:
+            return list(range(images))
+
+        def record_at(self, _topic: str, entry: int) -> int:
+            looked_at.append(entry)
+            return entry
+
+    monkeypatch.setattr(depth_sources, "_depth_image", lambda *_: np.ones((4, 4), np.float32))
+    steps = depth_sources._Steps(Log(), "depth", 0.001, PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5))
+    steps.smoothed(np.ones((4, 4), np.float32))
+    assert len(looked_at) == min(
+        images, depth_sources.STEP_IMAGES, len([k for k in range(images) if k % 8 != 4])
+    )
+    assert not any(is_held_out(k) for k in looked_at)
