@@ -79,7 +79,11 @@ class StatedScaleConfig(Config):
     min_views: int = Field(default=3, ge=1)
     """Own depth images that must have measured a surface near a Gaussian."""
     min_gaussians: int = Field(default=100, ge=1)
-    """Such Gaussians, of all peers together, that are needed; with fewer the factor is 1."""
+    """Such Gaussians that a peer needs to be asked; the factor is the median of those that peers ask for."""
+    views: int = Field(default=128, ge=1)
+    """Most own depth images that are looked at, evenly spaced."""
+    most: float = Field(default=5.0, ge=1.0)
+    """Largest factor: where a peer asks for more, it is wrong rather than the cameras."""
     share: float = Field(default=0.9, gt=0.0, lt=1.0)
     """Of the ratios of distance to stated deviation, the share whose quantile is compared with that of normal errors;
     the largest ratios are of other surfaces behind the Gaussians."""

@@ -22,6 +22,8 @@ from duagc.pipeline.consensus.evidence import Evidence, MapInformation, rows_by_
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import pack_information
 
+STATED_KINDS: tuple[WeightKind, ...] = ("diagonal", "block")
+"""Those that state deviations, not only how robots compare."""
 UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, UNIT_SIGMA_COLOR, UNIT_SIGMA_OPACITY = 0.01, 1.0, 0.07, 0.5
 """Standard deviations of a weight of one: mean, coordinates of vec log Sigma, colors, opacity logits."""
 
@@ -44,7 +46,7 @@ def shared_evidence(
         kind: of the weights; `diagonal` depends on the frame, see `in_world`.
     """
     full = Evidence.from_map(owner, gaussians, information, T_map_keyframe)
-    if kind in ("block", "diagonal"):
+    if kind in STATED_KINDS:
         return full
     if kind == "scalar":
         ones = np.ones((len(full), 1))

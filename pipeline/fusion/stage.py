@@ -17,7 +17,7 @@ from duagc.pipeline.base.shelf import SHELF, ShelvedList
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
-from duagc.pipeline.consensus.weighting import in_world, self_information
+from duagc.pipeline.consensus.weighting import STATED_KINDS, in_world, self_information
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.finest_views import from_finest_views
 from duagc.pipeline.fusion.finetune import finetune_map
@@ -191,7 +191,7 @@ def _untrained(
         color_sigma=own.information.color_sigma,
         pixels_per_sample=own.information.color_pixels_per_sample,
     )
-    if not context.config.stated_scale.enabled:
+    if not context.config.stated_scale.enabled or context.weights not in STATED_KINDS:
         return valid, fused
     seen = ShelvedList(DepthView(view.usable_depth, view.T_world_camera) for view in views)
     peers = valid.uncontradicted.values()

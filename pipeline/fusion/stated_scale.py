@@ -16,6 +16,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.fusion import StatedScaleConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.surface_distance import DepthView, median_distances
 from duagc.pipeline.splat.information import MEAN, gaussians_of, sigma_along
 
@@ -29,17 +30,29 @@ def stated_scale(
     share is one at which most errors are those of the surface in question; the largest ratios are of others behind it.
     A factor below 1 is not taken: what both robots see well says little of the rest of a map.
 
+    Each peer asks for a factor of its own, and the median counts, of two the smaller: a minority of peers that state
+    too little does not make the robot's own map uncertain. What a single peer asks for is bounded as well.
+
     Args:
         peers: evidence of each that is used, in the frame of the views.
         camera: the robot's own.
         views: its own depth images.
-        config: which Gaussians count, and the share.
+        config: which Gaussians count, the share, the bounds.
     """
-    ratios = np.concatenate([np.zeros(0), *(_ratios(peer, camera, views, config) for peer in peers)])
-    if len(ratios) < config.min_gaussians:
+    some = [views[k] for k in evenly_spaced(len(views), min(config.views, len(views)))]
+    asked = sorted(
+        f for peer in peers if (f := _asked(_ratios(peer, camera, some, config), config)) is not None
+    )
+    if not asked:
         return 1.0
-    expected = NormalDist().inv_cdf(0.5 * (1 + config.share))
-    return max(1.0, float(np.quantile(ratios, config.share)) / expected)
+    return min(max(1.0, asked[(len(asked) - 1) // 2]), config.most)
+
+
+def _asked(ratios: Array, config: StatedScaleConfig) -> float | None:
+    """The factor that makes the ratios of a peer those of normal errors; None for too few."""
+    if len(ratios) < config.min_gaussians:
+        return None
+    return float(np.quantile(ratios, config.share)) / NormalDist().inv_cdf(0.5 * (1 + config.share))
 
 
 def _ratios(

@@ -75,9 +75,28 @@ def test_nothing_is_known_of_what_few_views_or_few_gaussians_show():
     many, few = peer(errors(3.0)), peer(errors(3.0, CONFIG.min_gaussians - 1))
     assert stated_scale([many], CAMERA, of_wall()[:2], CONFIG) == 1.0
     assert stated_scale([few], CAMERA, of_wall(), CONFIG) == 1.0
-    assert stated_scale([few, few], CAMERA, of_wall(), CONFIG) > 2.0
+    assert stated_scale([few, few], CAMERA, of_wall(), CONFIG) == 1.0
+    assert stated_scale([few, many], CAMERA, of_wall(), CONFIG) > 2.0
     assert stated_scale([], CAMERA, of_wall(), CONFIG) == 1.0
     assert stated_scale([many], CAMERA, of_wall(5.0), CONFIG) == 1.0  # no surface within the gate
+
+
+def certain(whole: Evidence, times: float) -> Evidence:
+    """The same with so many times the information."""
+    return Evidence("liar", whole.ids, whole.anchors, whole.theta, times * whole.information)
+
+
+def test_a_peer_that_claims_too_much_makes_no_map_uncertain():
+    honest, liar = peer(errors(1.3)), certain(peer(errors(1.0)), 1e8)
+    assert stated_scale([honest, liar], CAMERA, of_wall(), CONFIG) == pytest.approx(1.3, rel=0.05)
+    assert stated_scale([liar, honest, honest], CAMERA, of_wall(), CONFIG) == pytest.approx(1.3, rel=0.05)
+    assert stated_scale([liar], CAMERA, of_wall(), CONFIG) == CONFIG.most
+
+
+def test_of_many_views_some_are_looked_at():
+    views = of_wall() * 50
+    few = CONFIG.model_copy(update={"views": 4})
+    assert stated_scale([peer(errors(2.0))], CAMERA, views, few) == pytest.approx(2.0, rel=0.05)
 
 
 def test_gaussians_that_state_nothing_do_not_count():
