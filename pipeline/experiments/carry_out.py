@@ -36,6 +36,7 @@ from duagc.pipeline.runs import stages
 RESULT, SUITE, RECORDINGS = "result.json", "suite.toml", "recordings"
 SIMULATED = "seed_"  # in front of the names of simulated recordings
 UNTIL = "evaluation"
+SIMULATOR = "duagc.converters.simulate.team:simulate"
 
 
 def check_recordings(experiments: Sequence[Experiment], recordings: Mapping[str, Path]) -> None:
@@ -141,15 +142,17 @@ def read_result(path: Path) -> dict[str, Any]:
     raise DuagError(f"{path}: is no result of an experiment, expected what `duagc experiment run` writes")
 
 
-def recording_folder(out: Path, data: SimulatedData, seed: int) -> Path:
-    """Folder of a simulated recording; experiments with the same data share it.
+def recording_folder(out: Path, data: SimulatedData, seed: int, store: Path) -> Path:
+    """Folder of a simulated recording; experiments with the same data share it, simulators that differ do not.
 
     Args:
         out: folder of all experiments.
         data: what is simulated.
         seed: of it.
+        store: of what was computed before, which remembers digests.
     """
-    digest = hashlib.sha256(data.model_dump_json().encode()).hexdigest()[:12]
+    simulator = _digest_of([SIMULATOR], store)
+    digest = hashlib.sha256(f"{simulator}\n{data.model_dump_json()}".encode()).hexdigest()[:12]
     return out / RECORDINGS / f"{digest}-{seed}"
 
 
@@ -159,6 +162,7 @@ def prepare(
     out: Path,
     *,
     recordings: Mapping[str, Path],
+    store: Path,
     log: Callable[[str], None],
 ) -> Suite:
     """Simulate the recordings that are missing, and write the suite of all cells.
@@ -168,6 +172,7 @@ def prepare(
         profile: how much is computed.
         out: folder of all experiments.
         recordings: of the user, folders by name.
+        store: of what was computed before.
         log: gets a line for every recording that is simulated.
 
     Raises:
@@ -178,7 +183,7 @@ def prepare(
         data_of(experiment.file, profile, name) for name in experiment.file.configurations
     ):
         for seed in profile.seeds:
-            folder = recording_folder(out, data, seed)
+            folder = recording_folder(out, data, seed, store)
             name = f"{SIMULATED}{seed}" + ("" if data == profile.data else f".{folder.name.split('-')[0]}")
             folders[name], own[name] = folder, (seed, data)
             if not folder.exists():
@@ -248,18 +253,24 @@ def carry_out(
         Names of the cells that failed.
 
     Raises:
-        DuagError: what a user can fix.
+        DuagError: what a user can fix; or the code was changed meanwhile.
     """
     chosen = experiment.profile(profile)
-    suite = prepare(experiment, chosen, out, recordings=recordings, log=log)
+    code = code_digest(store)
+    suite = prepare(experiment, chosen, out, recordings=recordings, store=store, log=log)
     folder = out / experiment.name
     run_batch(suite, folder, store, engine, log=lambda line: log(f"{experiment.name}: {line}"))
+    if code_digest(store) != code:
+        raise DuagError(
+            f"{folder}: the code changed while its runs were computed, expected one; "
+            "the same command computes those of other code again"
+        )
     done = gather(suite, folder)
     rows = [_row(experiment, cell, folder, done.get(cell.name, {})) for cell in suite.cells.values()]
     document = {
         "experiment": experiment.name,
         "rule_sha256": experiment.sha256,
-        "code_sha256": code_digest(store),
+        "code_sha256": code,
         "profile": profile,
         "seeds": list(chosen.seeds),
         "recordings": list(recordings),
@@ -271,16 +282,22 @@ def carry_out(
 
 
 def code_digest(store: Path) -> str:
-    """Digest of the stages up to the evaluation, with all that they import and the kernels as they are built here.
+    """Digest of the simulator and the stages up to the evaluation, with all that they import and the built kernels.
 
     Every run of an experiment is of this code: those of other code are not taken from the store.
 
     Args:
         store: of what was computed before, which remembers digests.
     """
+    used = stages.STAGES[: 1 + stages.STAGES.index(stages.EVALUATION)]
+    return _digest_of([SIMULATOR, *(stage.code for stage in used)], store)
+
+
+def _digest_of(functions: Sequence[str], store: Path) -> str:
+    """Digest of functions and of all that they import."""
     reader, modules = CodeReader(store / "code.json"), dict[str, str]()
-    for stage in stages.STAGES[: 1 + stages.STAGES.index(stages.EVALUATION)]:
-        modules |= reader.version_of(stage.code).modules
+    for function in functions:
+        modules |= reader.version_of(function).modules
     return hashlib.sha256(json.dumps(modules, sort_keys=True).encode()).hexdigest()
 
 

@@ -2,7 +2,8 @@
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.batch.cell import CellState, run_folder, write_state
 from duagc.pipeline.batch.suite import read_suite
+from duagc.pipeline.experiments import carry_out as carrying_out
 from duagc.pipeline.experiments.carry_out import (
     RECORDINGS,
     RESULT,
@@ -65,7 +67,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = read_experiment("mine", root / "rules").profile("small").data
     fake = fake_run.make(root / "fake")
     for seed in range(6):  # recordings that are there already
-        shutil.copytree(fake.recording, recording_folder(root / "out", data, seed))
+        with _small_code():
+            there = recording_folder(root / "out", data, seed, root / "store")
+        shutil.copytree(fake.recording, there)
     _carry_out(root, Measured("seed_5-lossy-5"))
     return root
 
@@ -73,8 +77,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _carry_out(root: Path, engine: Measured) -> list[str]:
     """Of a pipeline of one small stage, whose code is quickly read."""
     said: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        _only_stage(patch, "closest")
+    with _small_code():
         carry_out(
             read_experiment("mine", root / "rules"),
             "small",
@@ -87,7 +90,15 @@ def _carry_out(root: Path, engine: Measured) -> list[str]:
     return said
 
 
-def _only_stage(patch: pytest.MonkeyPatch, function: str) -> None:
+@contextmanager
+def _small_code() -> Iterator[pytest.MonkeyPatch]:
+    with pytest.MonkeyPatch.context() as patch:
+        _only_stage(patch, "closest")
+        yield patch
+
+
+def _only_stage(patch: pytest.MonkeyPatch, function: str, simulator: str = "DuagError") -> None:
+    patch.setattr(carrying_out, "SIMULATOR", f"duagc.pipeline.base.errors:{simulator}")
     only = replace(stages.EVALUATION, code=f"duagc.pipeline.base.errors:{function}")
     patch.setattr(stages, "EVALUATION", only)
     patch.setattr(stages, "STAGES", (only, stages.REPORT))
@@ -108,10 +119,29 @@ def test_a_recording_that_is_missing_is_simulated_from_its_seed(place: Path, tmp
     experiment = read_experiment("mine", place / "rules")
     profile = experiment.profile("small").model_copy(update={"seeds": (3,)})
     said: list[str] = []
-    suite = prepare(experiment, profile, tmp_path, recordings={}, log=said.append)
+    suite = prepare(experiment, profile, tmp_path, recordings={}, store=tmp_path / "store", log=said.append)
     assert said == ["simulate: 2 robots, 2 frames each, seed 3"]
     parameters = json.loads((suite.cells["seed_3-plain-3"].folder / "recording.json").read_text())
     assert parameters["parameters"]["seed"] == 3
+
+
+def test_another_simulator_takes_no_recordings_of_the_one_before(place: Path, tmp_path: Path) -> None:
+    data = read_experiment("mine", place / "rules").profile("small").data
+    folders = []
+    for simulator in ("DuagError", "closest", "DuagError"):
+        with pytest.MonkeyPatch.context() as patch:
+            _only_stage(patch, "closest", simulator)
+            folders.append(recording_folder(tmp_path, data, 0, tmp_path / "store"))
+    assert folders[0] == folders[2] != folders[1]
+
+
+def test_code_that_changes_meanwhile_makes_no_result(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = (place / "out" / "mine" / RESULT).read_bytes()
+    digests = iter(["one", "another"])
+    monkeypatch.setattr(carrying_out, "code_digest", lambda _: next(digests))
+    with pytest.raises(DuagError, match="the code changed while its runs were computed"):
+        _carry_out(place, Measured("seed_5-lossy-5"))
+    assert (place / "out" / "mine" / RESULT).read_bytes() == before
 
 
 def test_the_result_keeps_values_reasons_and_the_rule(place: Path) -> None:
@@ -145,6 +175,8 @@ def test_the_page_says_where_sections_are_of_different_code(
     _only_stage(monkeypatch, "closest")
     assert result["code_sha256"] == code_digest(place / "store")
     _only_stage(monkeypatch, "DuagError")
+    assert result["code_sha256"] != code_digest(place / "store")
+    _only_stage(monkeypatch, "closest", simulator="closest")
     assert result["code_sha256"] != code_digest(place / "store")
     other = {"same": result, "older": {k: v for k, v in result.items() if k != "code_sha256"}}
     pages = {}

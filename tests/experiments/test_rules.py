@@ -270,10 +270,16 @@ def test_every_configuration_runs_on_its_own_data_alone(
 
     monkeypatch.setattr("duagc.pipeline.experiments.carry_out.simulate", simulate)
     monkeypatch.setattr("duagc.pipeline.experiments.carry_out.read_suite", lambda path: path)
+    monkeypatch.setattr(
+        "duagc.pipeline.experiments.carry_out.SIMULATOR", "duagc.pipeline.base.errors:closest"
+    )
     text = FILE.replace("[configurations.lossy]", "[configurations.lossy]\ndata = { overlap = 0.2 }")
     (folder / "mine.toml").write_text(text.replace("[0, 1, 2, 3, 4]", "[3, 4]"))
     found = read_experiment("mine", folder)
-    path = prepare(found, found.profile("small"), folder / "out", recordings={}, log=lambda _: None)
+    store = folder / "store"
+    path = prepare(
+        found, found.profile("small"), folder / "out", recordings={}, store=store, log=lambda _: None
+    )
     assert simulated == [(3, 0.6), (4, 0.6), (3, 0.2), (4, 0.2)]
     suite = SuiteFile.model_validate(tomllib.loads(Path(str(path)).read_text()))
     left = {
