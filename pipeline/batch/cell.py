@@ -12,13 +12,14 @@ import sys
 import time
 import traceback
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.machine import processors
+from duagc.pipeline.cache.claims import has_ended, this_process
 
 RUNS, CELLS = "runs", "cells"
 State = Literal["waiting", "running", "done", "failed"]
@@ -33,14 +34,14 @@ class CellState:
         attempts: how often it was begun.
         wall_s: that the last attempt took.
         error: the line of the last failure; "".
-        pid: of the process.
+        process: that runs it, as `claims.this_process` says; {} otherwise.
     """
 
     state: State = "waiting"
     attempts: int = 0
     wall_s: float = 0.0
     error: str = ""
-    pid: int = 0
+    process: dict[str, object] = field(default_factory=dict)
 
 
 def run_folder(out: Path, name: str) -> Path:
@@ -54,7 +55,7 @@ def run_folder(out: Path, name: str) -> Path:
 
 
 def read_state(out: Path, name: str) -> CellState:
-    """How far a cell is; one that was begun by a process that is gone waits again.
+    """How far a cell is; one that was begun on this machine by a process that has ended waits again.
 
     Args:
         out: folder of the batch.
@@ -62,8 +63,11 @@ def read_state(out: Path, name: str) -> CellState:
     """
     try:
         content = json.loads((out / CELLS / f"{name}.json").read_bytes())
-        return CellState(**content)
-    except (OSError, ValueError, TypeError):
+        state = CellState(**content)
+        if state.state == "running" and has_ended(state.process):
+            return CellState(attempts=state.attempts)
+        return state
+    except (OSError, ValueError, TypeError, AttributeError):
         return CellState()
 
 
@@ -94,7 +98,7 @@ def run_cell(suite_path: Path, out: Path, name: str, store: Path) -> str:
     """
     begin = time.monotonic()
     attempts = read_state(out, name).attempts + 1
-    write_state(out, name, CellState("running", attempts, pid=os.getpid()))
+    write_state(out, name, CellState("running", attempts, process=this_process()))
     error = ""
     try:
         _run(suite_path, out, name, store)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import tempfile
@@ -59,7 +60,7 @@ def run(plan: LengthPlan) -> dict[str, Any]:
         raise DuagError(
             f"{plan.recording}: its shortest log has {longest:.1f} s, expected {max(plan.seconds):g} s or more"
         )
-    rows = list(track(_rows(plan, source), "bench length", len(plan.seconds)))
+    rows = list(track(_rows(plan, source), "bench length", len(set(plan.seconds))))
     for before, row in pairwise(rows):
         seconds = row["seconds"] - before["seconds"]
         row["more_cpu_s_per_s"] = round((row["cpu_s"] - before["cpu_s"]) / seconds, 3)
@@ -76,7 +77,7 @@ def _rows(plan: LengthPlan, source: Recording) -> Iterator[dict[str, Any]]:
         folder = plan.keep
         if folder is None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="duagc-bench-")))
-        for seconds in sorted(plan.seconds):
+        for seconds in sorted(set(plan.seconds)):
             yield _row(plan, source, seconds, folder)
 
 
@@ -88,13 +89,12 @@ def _row(plan: LengthPlan, source: Recording, seconds: float, folder: Path) -> d
         source: the whole recording.
         seconds: of its logs.
         folder: where the part of the recording and the run go.
+
+    Raises:
+        DuagError: a part of another recording is there.
     """
     path, out = folder / f"recording{seconds:g}", folder / f"run{seconds:g}"
-    if (path / RECORDING_FILE).is_file():
-        part = Recording(path)
-    else:
-        shutil.rmtree(path, ignore_errors=True)  # a part that was not finished
-        part = part_of(source, len(source.robots), seconds, path)
+    part = _part(source, seconds, path)
     begun = out.exists() or out.with_name(f"{out.name}.part").exists()
     done = execute(THIS, part.path, out, processors=plan.threads, options=plan.options)
     front = [row for row in done.stages.values() if row["stage"] == "frontend"]
@@ -118,6 +118,22 @@ def _row(plan: LengthPlan, source: Recording, seconds: float, folder: Path) -> d
         "psnr_db": own["psnr_db"],
         "depth_l1_m": own["depth_l1_m"],
     }
+
+
+def _part(source: Recording, seconds: float, path: Path) -> Recording:
+    """The recording that its logs begin with; taken from where it stays, if it is of this recording."""
+    stays = path.with_name(f"{path.name}.of.json")
+    of = {name: row.get("digests") for name, row in source.description["robots"].items()}
+    if (path / RECORDING_FILE).is_file():
+        if not stays.is_file() or json.loads(stays.read_text(encoding="utf-8")) != of:
+            raise DuagError(
+                f"{path}: is not known to be of {source.path}, expected so; choose another --keep"
+            )
+        return Recording(path)
+    shutil.rmtree(path, ignore_errors=True)  # a part that was not finished
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stays.write_text(json.dumps(of), encoding="utf-8")
+    return part_of(source, len(source.robots), seconds, path)
 
 
 def format_table(result: dict[str, Any]) -> str:

@@ -319,8 +319,9 @@ def bounds_met(row: dict[str, Any], clean: dict[str, Any]) -> dict[str, bool] | 
     if row["dial"] in (CLEAN, ALL) or "failed" in row or "failed" in clean:
         return None
     return {
-        "ate": _within(row["ate_m"], ATE_RATIO * clean["ate_m"]),
-        "psnr": row["psnr_db"] is not None and row["psnr_db"] >= clean["psnr_db"] - PSNR_LOSS_DB,
+        "ate": clean["ate_m"] is not None and _within(row["ate_m"], ATE_RATIO * clean["ate_m"]),
+        "psnr": None not in (row["psnr_db"], clean["psnr_db"])
+        and row["psnr_db"] >= clean["psnr_db"] - PSNR_LOSS_DB,
         "component": row["components"] == 1,
         "worst": _within(row["worst_good_m"], WORST_M),
         "gap": _within(row["gap_sigma"], GAP_SIGMA),

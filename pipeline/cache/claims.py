@@ -35,7 +35,7 @@ class Claim:
         """
         self._folder = folder
         self._ended = threading.Event()
-        (folder / "owner.json").write_text(json.dumps(_owner()))
+        (folder / "owner.json").write_text(json.dumps(this_process()))
         self._beating = threading.Thread(target=self._beat, daemon=True)
         self._beating.start()
 
@@ -55,7 +55,9 @@ class Claim:
         self._ended.set()
         self._beating.join()
         with suppress(OSError):
-            if _read_owner(self._folder) == _owner():  # another one may have taken this process for dead
+            if (
+                _read_owner(self._folder) == this_process()
+            ):  # another one may have taken this process for dead
                 shutil.rmtree(self._folder)
 
 
@@ -105,7 +107,7 @@ class _Watch:
         """Whether the owner ended without giving the claim back."""
         self.owner = _read_owner(self._folder)
         if self.owner is not None and self.owner.get("host") == _host():
-            return not _is_alive(self.owner)
+            return has_ended(self.owner)
         beat = ""
         with suppress(OSError):
             beat = (self._folder / "beat").read_text()
@@ -134,7 +136,8 @@ def _read_owner(folder: Path) -> dict[str, object] | None:
     return owner if isinstance(owner, dict) else None
 
 
-def _owner() -> dict[str, object]:
+def this_process() -> dict[str, object]:
+    """This process, so that it is told from others of the same number."""
     return {"host": _host(), "pid": os.getpid(), "started": _started(os.getpid())}
 
 
@@ -156,6 +159,15 @@ def _started(pid: int) -> str:
         return ""
     fields = text[text.rfind(")") + 2 :].split()
     return "" if fields[0] in "ZX" else fields[19]
+
+
+def has_ended(process: dict[str, object]) -> bool:
+    """Whether a process is known to have ended: False for one of another machine, of which nothing is known.
+
+    Args:
+        process: as `this_process` described it.
+    """
+    return process.get("host") == _host() and not _is_alive(process)
 
 
 def _is_alive(owner: dict[str, object]) -> bool:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import new_file
 from duagc.pipeline.base.random_streams import generator
 from duagc.pipeline.base.templates import filled
+from duagc.pipeline.cache.publish import publish
 from duagc.pipeline.experiments.carry_out import RESULT, check_rule, read_result
 from duagc.pipeline.experiments.costs import write_costs
 from duagc.pipeline.experiments.overview import counted, judged_uses, read_uses
@@ -116,8 +116,11 @@ def _uses(judged: Sequence[JudgedExperiment]) -> list[dict[str, Any]]:
 
 
 def _write(path: Path, text: str) -> None:
-    with new_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    """Whole, though two commands that share a folder may write its page at the same time."""
+    try:
+        publish(path, text.encode())
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected to write a file") from error
 
 
 def _document(verdict: RuleVerdict) -> dict[str, Any]:

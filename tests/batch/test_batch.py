@@ -16,6 +16,7 @@ from duagc.pipeline.batch.cell import CellState, read_state, run_cell, run_folde
 from duagc.pipeline.batch.engines import LocalEngine
 from duagc.pipeline.batch.results import gather, paired
 from duagc.pipeline.batch.suite import Suite, read_suite
+from duagc.pipeline.cache.claims import this_process
 from tests.fixtures import fake_run
 from tests.fixtures.commands import assert_one_line, duagc_here
 
@@ -229,3 +230,14 @@ def test_cells_share_what_they_have_in_common(tmp_path: Path) -> None:
     assert again.returncode == 0
     assert "up to date" in (tmp_path / "out" / "cells" / "room-plain-0.log").read_text()
     assert run_cell(path, tmp_path / "out", "room-plain-0", tmp_path / "out" / ".duagc-store") == ""
+
+
+def test_a_cell_whose_process_has_ended_waits_again(tmp_path: Path) -> None:
+    here = this_process()
+    for process, state in (
+        (here, "running"),
+        ({**here, "started": "0"}, "waiting"),  # another process of that number
+        ({**here, "host": "another"}, "running"),  # of which nothing is known
+    ):
+        write_state(tmp_path, "cell", CellState("running", 2, process=process))
+        assert (read_state(tmp_path, "cell").state, read_state(tmp_path, "cell").attempts) == (state, 2)

@@ -86,8 +86,8 @@ def test_tasks_of_ray_compute_what_this_machine_does_though_one_is_killed(
                 state = read_state(tmp_path, name)
                 if state.state == "running":
                     time.sleep(2.0)
-                    os.kill(state.pid, signal.SIGKILL)
-                    killed.append(state.pid)
+                    os.kill(int(str(state.process["pid"])), signal.SIGKILL)
+                    killed.append(state.process["pid"])
                     return
             time.sleep(0.05)
 

@@ -155,6 +155,8 @@ def test_bounds_are_ratios_to_the_clean_cell() -> None:
     )
     assert missed == {"ate": False, "psnr": False, "component": False, "worst": False, "gap": False}
     assert bench.bounds_met(row("blur", 0.1, 26.9) | {"ate_m": None}, clean) is not None
+    unknown = clean | {"ate_m": None, "psnr_db": None}  # two frames cannot be aligned
+    assert bench.bounds_met(row("blur", 0.001, 40.0), unknown) == met | {"ate": False, "psnr": False}
     assert bench.bounds_met(row("all", 1.0, 10.0), clean) is None
     assert bench.bounds_met({"dial": "lens", "failed": "no"}, clean) is None
 

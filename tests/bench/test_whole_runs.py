@@ -127,6 +127,16 @@ def test_what_is_kept_is_completed(
     assert sorted(path.name for path in (tmp_path / "kept").glob("run*")) == ["run0.1", "run0.2"]
 
 
+def test_what_is_kept_of_another_recording_is_refused(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(length, "THIS", (str(command(tmp_path, 3.0)),))
+    other = whole_runs.part_of(recording, 2, 0.2, tmp_path / "other")
+    length.run(length.LengthPlan(other.path, (0.1, 0.1), threads=1, keep=tmp_path / "kept"))
+    with pytest.raises(DuagError, match=r"recording0\.1: is not known to be of .*choose another --keep"):
+        length.run(length.LengthPlan(recording.path, (0.1,), threads=1, keep=tmp_path / "kept"))
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
