@@ -35,7 +35,7 @@ _M = np.array(
 T_MARKER_CAMERA = se3.from_rotation_translation(so3.project(_M[:, :3]), _M[:, 3])
 
 
-class Options(tum_layout.AssociationOptions):
+class Options(tum_layout.SequenceOptions):
     """Lens and association."""
 
     undistort: bool = True

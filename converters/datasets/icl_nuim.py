@@ -19,7 +19,6 @@ from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of
 from duagc.converters.layouts.tum_layout import Poses
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
-from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 1 / 5000
@@ -27,7 +26,7 @@ CAMERA = PinholeCamera(640, 480, 481.20, 480.00, 319.50, 239.50)
 S = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
-class Options(Config):
+class Options(image_folder.LengthOptions):
     """Time and numbering."""
 
     rate_hz: int = Field(30, gt=0)
@@ -49,7 +48,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     images = _read_associations(src / "associations.txt")
     poses, path = _read_poses(src)
     shift = _shift(images, poses, settings, path)
-    numbers = sorted(images)
+    numbers = settings.first(sorted(images))
     stamps = stamps_of(numbers, settings.rate_hz)
     frames = [
         FrameFiles(n, stamp, images[n][1], images[n][0], poses.get(n + shift))

@@ -18,13 +18,12 @@ from duagc.converters.layouts.image_files import options_of, rigid
 from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, read_bytes, read_text
-from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 0.001
 
 
-class Options(Config):
+class Options(image_folder.LengthOptions):
     """Time; exported scans have none."""
 
     rate_hz: int = Field(30, gt=0)
@@ -43,6 +42,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     numbers = sorted(set(color) & set(depth))
     if not numbers:
         raise DuagError(f"{root}: no number is both in color/ and in depth/, expected N.jpg and N.png")
+    numbers = settings.first(numbers)
     warnings = [f"no time stamps: made from frame numbers at {settings.rate_hz} Hz"]
     alone = len(set(color) ^ set(depth))
     if alone:

@@ -19,14 +19,13 @@ from duagc.converters.layouts.image_files import options_of, rigid
 from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
-from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 0.001
 OPENCV_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-class Options(Config):
+class Options(image_folder.LengthOptions):
     """Time and choice of images."""
 
     rate_hz: int = Field(1, gt=0)
@@ -70,6 +69,8 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     taken = [e for e in entries if settings.bad or not e[2]]
     if not taken:
         raise DuagError(f"{path}: names no usable image, expected frames")
+    bad = len(entries) - len(taken)
+    taken = settings.first(taken)
     stamps = stamps_of(range(len(taken)), settings.rate_hz)
     frames = [
         FrameFiles(
@@ -82,8 +83,8 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         for number, (stamp, (name, T, _)) in enumerate(zip(stamps, taken, strict=True))
     ]
     warnings = ["photographs, not a video: consecutive frames may be far apart", "no time stamps"]
-    if len(taken) < len(entries):
-        warnings.append(f"{len(entries) - len(taken)} images are marked as bad and were left out")
+    if bad:
+        warnings.append(f"{bad} images are marked as bad and were left out")
     clip = Clip("", frames, camera, DEPTH_SCALE, sensors={"depth": "rendered from a laser scan"})
     image_folder.write_parts(
         out, "scannetpp", src, clip, robots=robots, options=settings, warnings=warnings, force=force

@@ -22,6 +22,7 @@ from duagc.converters.layouts import reference_poses
 from duagc.converters.layouts.calibrated import ColorLens, correct, numbers, resampled
 from duagc.converters.layouts.displaced_depth import DepthRegistration
 from duagc.converters.layouts.image_files import kept_color, options_of, read_color, read_depth, rigid
+from duagc.converters.layouts.image_folder import LengthOptions
 from duagc.converters.layouts.self_check import ReprojectionCheck
 from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
@@ -32,7 +33,6 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.base.progress import track
-from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import depth_error, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
@@ -54,7 +54,7 @@ LENGTHS = {
 """How many numbers options hold that are lists of numbers."""
 
 
-class Options(Config):
+class Options(LengthOptions):
     """Cameras and time; the defaults are those of the Kinect that recorded 7-Scenes."""
 
     depth_focal_px: float = Field(585.0, gt=0)
@@ -190,6 +190,8 @@ def _parts(
     sequences = []
     for folder in folders:
         frames, missing = list_frames(folder)
+        frames = options.first(frames)
+        missing = [number for number in missing if number < frames[-1].number]
         sequences.append((folder.name if len(folders) > 1 or folder != src else "", frames))
         if missing:
             shown = ", ".join(str(n) for n in missing[:10]) + (", ..." if len(missing) > 10 else "")

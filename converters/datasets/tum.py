@@ -38,7 +38,7 @@ CAMERAS = {  # intrinsics and (k1, k2, p1, p2, k3), as the dataset's page gives 
 }
 
 
-class Options(tum_layout.AssociationOptions):
+class Options(tum_layout.SequenceOptions):
     """Camera and association."""
 
     camera: Literal["auto", "freiburg1", "freiburg2", "freiburg3"] = "auto"

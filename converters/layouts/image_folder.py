@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from duagc.converters.layouts.image_files import kept_color, read_color, read_depth
 from duagc.converters.layouts.self_check import ReprojectionCheck
@@ -29,6 +30,7 @@ from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording.greatest_depth import unmeasured
 
+Item = TypeVar("Item")
 LOOKED_AT, LOOKED_AT_EVERY = 8, 8  # depth images, the first of a robot, and how far apart
 
 
@@ -53,6 +55,21 @@ class FrameFiles:
     T_world_camera: Array | None = None
     depth_stamp_ns: int | None = None
     T_world_depth: Array | None = None
+
+
+class LengthOptions(Config):
+    """How much of a sequence is converted."""
+
+    frame_limit: int = Field(0, ge=0)
+    """Most frames of a sequence, from its first, before it is cut into the parts of robots; 0: all."""
+
+    def first(self, frames: list[Item]) -> list[Item]:
+        """The frames that are converted.
+
+        Args:
+            frames: of the sequence.
+        """
+        return frames[: self.frame_limit or None]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from duagc.converters.layouts.image_folder import FrameFiles
+from duagc.converters.layouts.image_folder import FrameFiles, LengthOptions
 from duagc.converters.robot_writer import NANOSECONDS
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
@@ -43,6 +43,10 @@ class AssociationOptions(Config):
         """Largest difference of times of color and depth."""
         default = {"all": TOLERANCE_NS / NANOSECONDS, "official": 0.02, "nearest": 0.08}[self.association]
         return round((self.max_difference_s or default) * NANOSECONDS)
+
+
+class SequenceOptions(AssociationOptions, LengthOptions):
+    """Association, and how much of a sequence is converted."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +170,11 @@ class Poses:
         return se3.from_rotation_translation(R, a[:3, 3] + share * (b[:3, 3] - a[:3, 3]))
 
 
-def frames_of(src: Path, options: AssociationOptions) -> tuple[list[FrameFiles], Poses | None, list[str]]:
+def frames_of(src: Path, options: SequenceOptions) -> tuple[list[FrameFiles], Poses | None, list[str]]:
     """Frames of a sequence with the pose of its body, the poses, and warnings."""
     if not src.is_dir():
         raise DuagError(f"{src}: no such folder, expected rgb.txt, depth.txt and groundtruth.txt in it")
-    color, depth = read_list(src / "rgb.txt"), read_list(src / "depth.txt")
+    color, depth = options.first(read_list(src / "rgb.txt")), read_list(src / "depth.txt")
     pairs: list[tuple[Listed, Listed | None]] = list(associate(color, depth, options))
     if not pairs:
         raise DuagError(

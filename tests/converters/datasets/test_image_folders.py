@@ -69,6 +69,18 @@ def test_what_is_in_the_recording_is_what_was_rendered(made: dict[str, tuple[Pat
     assert check["reprojection_median_m"] < 0.01
 
 
+@pytest.mark.parametrize("name", ["bonn", "icl-nuim", "replica", "scannet", "scannetpp", "tum"])
+def test_a_limit_takes_the_first_frames(
+    made: dict[str, tuple[Path, Path]], tmp_path: Path, name: str
+) -> None:
+    src, whole = made[name]
+    registry.convert(name, src, tmp_path / "few", options=[*CASES[name][1], "frame_limit=2"], robots=1)
+    with open_rgbd(tmp_path / "few" / "alpha.mcap") as few, open_rgbd(whole / "alpha.mcap") as log:
+        assert len(few) == 2 < len(log)
+        assert few.frame(1).stamp_ns == log.frame(1).stamp_ns
+        assert np.array_equal(few.frame(1).color, log.frame(1).color)
+
+
 @pytest.mark.parametrize("name", ["replica", "replica-multiagent", "icl-nuim", "scannetpp"])
 def test_lossless_is_lossless(made: dict[str, tuple[Path, Path]], name: str) -> None:
     """Where nothing has to be resampled, color is the file's bytes and depth its numbers."""

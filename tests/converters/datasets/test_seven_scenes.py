@@ -102,6 +102,10 @@ def test_missing_numbers_are_skipped_and_told(broken: Path, tmp_path: Path) -> N
     stamps = [f.stamp_ns for f in open_rgbd(recording.log("alpha")).frames()]
     assert stamps == [n * 10**9 // 30 for n in (0, 1, 3, 4, 5, 6)]
     assert "seq-01: 1 frame numbers are missing and were skipped: 2" in recording.description["warnings"]
+    convert(broken, tmp_path / "few", frame_limit=2)
+    few = Recording(tmp_path / "few")
+    assert [f.stamp_ns for f in open_rgbd(few.log("alpha")).frames()] == stamps[:2]
+    assert not [line for line in few.description["warnings"] if "missing" in line]
 
 
 def test_sequences_without_poses_have_no_ground_truth(broken: Path, tmp_path: Path) -> None:
