@@ -36,7 +36,7 @@ REQUIRED = {
 OPTIONAL = {
     "open3d": (
         "open3d-cpu",
-        "mesh scenes of `duagc simulate`, `duagc bench frontend`",
+        "all scenes of `duagc simulate` but a plain room, `duagc export --points`, benches, tracking by Open3D",
         "pip install open3d-cpu",
     ),
     "cryptography": (

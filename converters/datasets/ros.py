@@ -83,7 +83,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
 
 
 def _robot_log(log: Log, part: Source) -> RobotLog:
-    """The log of one robot; where topics of several cannot be told apart, the error says how."""
+    """The log of one robot; where topics of several cannot be separated, the error says how."""
     try:
         return RobotLog(log, part.namespace, part.settings)
     except DuagError as error:

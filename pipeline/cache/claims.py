@@ -137,7 +137,7 @@ def _read_owner(folder: Path) -> dict[str, object] | None:
 
 
 def this_process() -> dict[str, object]:
-    """This process, so that it is told from others of the same number."""
+    """This process, so that a later one of its number is not taken for it."""
     return {"host": _host(), "pid": os.getpid(), "started": _started(os.getpid())}
 
 

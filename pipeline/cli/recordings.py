@@ -14,7 +14,6 @@ from duagc.pipeline.cli.common import (
     ConfigFile,
     Force,
     Json,
-    Out,
     Overrides,
     StoreFolder,
     Workers,
@@ -38,7 +37,10 @@ def info(
     ] = False,
     preview: Annotated[
         Path | None,
-        typer.Option(help="Write a PNG of some color and depth images of every robot.", show_default=False),
+        typer.Option(
+            help="Of a recording: write a PNG of some color and depth images of every robot.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
     """Say what is in a recording, a run or a log; of a log of another program also what would be converted and why.
@@ -50,6 +52,8 @@ def info(
     from duagc.pipeline import recording
 
     if describe.is_foreign(path):
+        if preview is not None:
+            raise DuagError(f"{path}: is another program's log, expected a recording with --preview")
         described = describe.describe(path)
         text = describe.toml_text(described) if as_toml else describe.format_description(described)
         print(json.dumps(described, indent=2) if as_json else text)
@@ -65,7 +69,10 @@ def info(
 @app.command()
 def check(
     path: Annotated[Path, typer.Argument(help="A recording, or the log of one robot.", show_default=False)],
-    config: ConfigFile = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", help="TOML file of limits; see docs/reference/config.md, at its end."),
+    ] = None,
     overrides: Overrides = None,
     store: StoreFolder = None,
     as_json: Json = False,
@@ -177,7 +184,7 @@ def _place_of_calibrated(place: ExitStack, recording: "Recording", out: Path, fo
 @app.command()
 def recover(
     source: Annotated[Path, typer.Argument(help="A damaged log or recording; it stays as it is.")],
-    out: Out,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Log or folder to write.", show_default=False)],
     force: Force = False,
 ) -> None:
     """Save every message that is whole in a log that is cut or damaged, and list what is lost.

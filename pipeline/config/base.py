@@ -3,7 +3,7 @@
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -13,6 +13,8 @@ from duagc.pipeline.base.files import read_text
 
 class Config(BaseModel):
     """Base of every section: immutable, unknown names refused, defaults validated."""
+
+    LISTED: ClassVar[str] = "docs/reference/config.md"  # where users find its settings
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", validate_default=True, use_attribute_docstrings=True
@@ -50,7 +52,7 @@ def load_config(model: type[Model], path: Path | None = None, overrides: Sequenc
         if first["type"] == "extra_forbidden":
             nearest = _nearest(model, [str(part) for part in first["loc"]])
             raise DuagError(
-                f"{source}: {name} is not a known setting, {nearest}; see `duagc config show`"
+                f"{source}: {name} is not a known setting, {nearest}; see {model.LISTED}"
             ) from error
         if first["type"] == "value_error":
             raise DuagError(f"{source}: {first['ctx']['error']}") from error

@@ -1,5 +1,7 @@
 """The configuration of a run: all sections in one model."""
 
+from typing import ClassVar
+
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.calibration import CalibrationConfig
 from duagc.pipeline.config.consensus import MapMatching
@@ -12,6 +14,8 @@ from duagc.pipeline.config.information import InformationConfig
 
 class RunConfig(Config):
     """Everything that decides what a run computes."""
+
+    LISTED: ClassVar[str] = "`duagc config show`"
 
     seed: int = 0
     """Seed of every random stream of the run."""

@@ -96,7 +96,7 @@ def _parameter(p: Any) -> tuple[str, str, str]:
     if p.param_type_name == "argument":
         name, default = (p.metavar or p.name).upper(), "required" if p.required else ""
     else:
-        name, default = ", ".join(p.opts), "required" if p.required else _default(p)
+        name, default = ", ".join((*p.opts, *p.secondary_opts)), "required" if p.required else _default(p)
     return f"`{name}`", default, cell(p.help or "")
 
 
