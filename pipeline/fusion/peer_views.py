@@ -70,20 +70,21 @@ def _views(
     colors: Mapping[str, ColorMap],
 ) -> Iterator[PosedRgbd]:
     rasterizer, drawn = Rasterizer(threads=context.threads), ""
+    kind = context.config.finetune.peer_pixels
     for number, (name, T_world_camera) in enumerate(chosen):
         if name != drawn:
             own_colors = colors[name].of(evidence[name])
             gaussians, drawn = gaussians_of(own_colors.ids, own_colors.anchors, own_colors.theta), name
-            F_position = own_colors.position_information()
+            if kind not in ("covered", "random"):
+                sigma_m, _ = sigma_along(own_colors.position_information(), gaussians.normals())
         T_camera_world = se3.inverse(T_world_camera)
         render = rasterizer.forward(gaussians, context.camera, T_camera_world, depth_kind=depth_kinds[name])
         seen = render.alpha >= COVERED
-        kind = context.config.finetune.peer_pixels
         if kind == "random":
             stream = random_streams.generator(context.seed, "fusion.peer-pixels", view=number)
             seen &= stream.random(seen.shape) < 0.5
         elif kind != "covered":
-            stated = _relative_sigma(gaussians, F_position, context, T_camera_world, depth=depth_kinds[name])
+            stated = _relative_sigma(gaussians, sigma_m, context, T_camera_world, depth=depth_kinds[name])
             middle = np.median(stated[seen]) if seen.any() else 0.0
             seen &= stated <= middle if kind == "certain" else stated > middle
         share = np.where(seen, render.alpha, np.float32(1))
@@ -93,13 +94,12 @@ def _views(
 
 
 def _relative_sigma(
-    gaussians: Gaussians, F_position: Array, context: MapContext, T_camera_world: Array, *, depth: DepthKind
+    gaussians: Gaussians, sigma_m: Array, context: MapContext, T_camera_world: Array, *, depth: DepthKind
 ) -> NDArray[np.float32]:
     """Stated deviation of what a pixel blends, over its depth [h, w]; infinite where nothing is stated.
 
-    F_position: [n, 3, 3], information of the means, 1/m^2.
+    sigma_m: [n], of each Gaussian across its disc; infinite where it is not determined.
     """
-    sigma_m, _ = sigma_along(F_position, gaussians.normals())
     blended = blended_values(
         gaussians,
         sigma_m,
