@@ -62,7 +62,9 @@ def run(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder of all experiments; goes on where it was stopped.")
     ] = Path("outputs/experiments"),
-    everything: Annotated[bool, typer.Option("--all", help="Every experiment.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Every experiment; one of them needs the extra gicp.")
+    ] = False,
     profile: Annotated[str, typer.Option(help="small or full.")] = "small",
     recording: Annotated[
         list[str] | None,
