@@ -153,7 +153,7 @@ def bench_team(
             )
     run = RunFolder(run_folder)
     settings = load_config(RunConfig, run.config_file, overrides or [])
-    source = Recording(run.recording if recording is None else recording)
+    source = Recording(run.recording_at(recording))
     result = team_faults.run(run, source, settings.exchange, seed=settings.seed, checks=chosen, seeds=seeds)
     print(json.dumps(result, indent=2) if as_json else team_faults.format_table(result))
 
@@ -181,7 +181,7 @@ def bench_reference(
 
     determinism.configure_opencv()
     run = RunFolder(run_folder)
-    source = Recording(run.recording if recording is None else recording)
+    source = Recording(run.recording_at(recording))
     result = pose_reference.run(run, source, load_config(RunConfig, run.config_file, []).frontend)
     print(json.dumps(result, indent=2) if as_json else pose_reference.format_table(result))
 
@@ -326,6 +326,9 @@ def numbers(option: str, text: str, low: float, high: float) -> list[float]:
     return numbers
 
 
+LARGEST_PX = 16_384
+
+
 def counts(option: str, text: str) -> list[int]:
     """Positive numbers out of text like 60k,1M."""
     counts = []
@@ -339,12 +342,15 @@ def counts(option: str, text: str) -> list[int]:
     return counts
 
 
-def sizes_of(text: str) -> list[tuple[int, int]]:
+def sizes_of(text: str, option: str = "--sizes") -> list[tuple[int, int]]:
     """Widths and heights out of text like 320x240,640x480."""
     sizes = []
     for word in text.split(","):
         width, cross, height = word.partition("x")
-        if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-            raise typer.BadParameter(f"{word!r} is not an image size, such as 640x480", param_hint="--sizes")
+        sound = cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)
+        if not sound or max(int(width), int(height)) > LARGEST_PX:
+            raise typer.BadParameter(
+                f"{word!r} is not an image size up to {LARGEST_PX} px, such as 640x480", param_hint=option
+            )
         sizes.append((int(width), int(height)))
     return sizes

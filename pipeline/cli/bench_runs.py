@@ -126,7 +126,7 @@ def bench_information(
     if out is not None and out.exists():
         raise DuagError(f"{out}: exists, expected a new folder")
     run = RunFolder(run_folder)
-    source = Recording(run.recording if recording is None else recording)
+    source = Recording(run.recording_at(recording))
     plan = information_structure.StructurePlan(
         sample, tuple(counts("--windows", windows)), robots=(robot,) if robot else (), seed=seed
     )

@@ -14,6 +14,9 @@ def view(
     path: Annotated[Path, typer.Argument(help="A run or a recording.", show_default=False)],
     save: Annotated[Path | None, typer.Option(help="Write a .rrd file instead of opening a window.")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a PNG instead of opening a window.")] = None,
+    recording: Annotated[
+        Path | None, typer.Option(help="Of a run: where its recording is now.", show_default=False)
+    ] = None,
 ) -> None:
     """Open a run or a recording in Rerun.
 
@@ -21,7 +24,7 @@ def view(
     """
     from duagc.pipeline.viewing import rerun_view
 
-    rerun_view.view(path, save=save, screenshot=screenshot)
+    rerun_view.view(path, save=save, screenshot=screenshot, recording=recording)
 
 
 @app.command()

@@ -65,7 +65,7 @@ def bench_robustness(
     for name in dials:
         if name not in known:
             raise typer.BadParameter(f"{name!r} is not one of {', '.join(known)}", param_hint="--only")
-    if len(sizes := sizes_of(size)) != 1:
+    if len(sizes := sizes_of(size, "--size")) != 1:
         raise typer.BadParameter(f"{size!r} is not one image size", param_hint="--size")
     determinism.configure_opencv()
     settings = load_config(RunConfig, config, [*robustness.UNSCORED, *(overrides or [])])

@@ -223,7 +223,7 @@ def replay(
 
     run = RunFolder(run_folder)
     robots = [robot] if robot else list(run.robots)
-    comparisons = replay_robots(run_folder, recording or run.recording, robots, say)
+    comparisons = replay_robots(run_folder, run.recording_at(recording), robots, say)
     for c in comparisons:
         verdict = (
             "equal" if c.equal else f"DIFFERS: recorded {c.recorded[:12]}, recomputed {c.recomputed[:12]}"
@@ -262,7 +262,7 @@ def evaluate(
     from duagc.pipeline.runs.stages import EVALUATION
 
     run = RunFolder(run_folder)
-    source, threads = recording or run.recording, threads_per_worker(1)
+    source, threads = run.recording_at(recording), threads_per_worker(1)
     longer = None
     if own_longer:
         from duagc.pipeline.experiments.own_longer import own_longer as train_longer
@@ -291,7 +291,7 @@ def report(
     from duagc.pipeline.runs.folder import RunFolder
     from duagc.pipeline.runs.stages import REPORT
 
-    source = recording or RunFolder(run_folder).recording
+    source = RunFolder(run_folder).recording_at(recording)
     with REPORT.running(run_folder):
         print(write_report(run_folder, source))
 

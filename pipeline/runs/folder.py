@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
@@ -27,11 +28,20 @@ from duagc.pipeline.messages import (
     Odometry,
     Submap,
 )
-from duagc.pipeline.recording import read_exposures, read_log
+from duagc.pipeline.recording import Recording, read_exposures, read_log
 from duagc.pipeline.runs.digest import digest_file
 from duagc.schemas import topics
 
 SCHEMA = 1  # of manifest.json
+TYPES = {
+    "recording": str,
+    "config": str,
+    "inputs": dict,
+    "outputs": dict,
+    "stages": dict,
+    "calibration": dict,
+}
+"""What the manifest holds."""
 METRICS_SCHEMA = 2  # of metrics.json; 1 had a reason for every name, and other names of loop closures
 
 
@@ -215,6 +225,28 @@ class RunFolder:
             raise DuagError(f"{path}: recording {named} not found; give --recording")
         return (self.path / named).resolve()
 
+    def recording_at(self, path: Path | None = None) -> Path:
+        """The recording that this run was made of, wherever it is now.
+
+        Args:
+            path: its folder; None: where the manifest says.
+
+        Raises:
+            DuagError: it is not there, or another one, by the digests of its logs.
+        """
+        path = path or self.recording
+        recording = Recording(path)
+        for robot, expected in self._json("manifest.json").get("inputs", {}).items():
+            log = recording.log(robot)
+            found = recording.digest(log.name)
+            found = digest_file(log) if found == "nothing" else found
+            if found != expected:
+                raise DuagError(
+                    f"{log}: has digest {found[:12]}, expected {str(expected)[:12]}, the log that "
+                    f"{self.path} was made of"
+                )
+        return path
+
     @property
     def config_file(self) -> Path:
         """config.toml, checked against the manifest where there is one.
@@ -264,13 +296,17 @@ class RunFolder:
         if not path.is_file():
             return {}
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(read_text(path, "a JSON object"))
         except ValueError as error:
             raise DuagError(f"{path}: not valid JSON: {error}") from error
         if not isinstance(content, dict):
             raise DuagError(f"{path}: found a {type(content).__name__}, expected a JSON object")
         if content.get("schema", schema) != schema:
             raise DuagError(f"{path}: schema is {content['schema']}, expected {schema}")
+        for key, kind in (TYPES if name == "manifest.json" else {}).items():
+            if not isinstance(content.get(key, kind()), kind):
+                found = type(content[key]).__name__
+                raise DuagError(f"{path}: {key} is a {found}, expected a {kind.__name__}")
         return content
 
 

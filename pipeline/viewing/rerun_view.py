@@ -33,19 +33,27 @@ LOG_TIME = "message_log_time"  # timeline that Rerun gives to a log
 VIEWER_MEMORY = "4GiB"
 
 
-def view(path: Path, save: Path | None = None, screenshot: Path | None = None) -> None:
+def view(
+    path: Path, save: Path | None = None, screenshot: Path | None = None, recording: Path | None = None
+) -> None:
     """Open a run, a recording or a log in Rerun, or write it to a .rrd file or a picture.
 
     Args:
         path: folder of a run or of a recording, or an .mcap or .rrd file.
         save: write this .rrd file instead of opening a window.
         screenshot: write this PNG instead.
+        recording: of a run, where it is now; None: where the manifest says.
 
     Raises:
         DuagError: the path is none of these, or no picture can be drawn on this machine.
     """
+    for wanted, suffix in ((save, ".rrd"), (screenshot, ".png")):
+        if wanted is None:
+            continue
+        if wanted.suffix != suffix or not wanted.absolute().parent.is_dir():
+            raise DuagError(f"{wanted}: found no such place, expected NAME{suffix} in a folder that exists")
     with tempfile.TemporaryDirectory(prefix="duagc-view-") as folder:
-        rrd = _as_rrd(Path(path), Path(folder))
+        rrd = _as_rrd(Path(path), Path(folder), recording)
         if save is not None:
             with new_file(save) as part:
                 shutil.copyfile(rrd, part)
@@ -55,7 +63,7 @@ def view(path: Path, save: Path | None = None, screenshot: Path | None = None) -
             _open_window(rrd)
 
 
-def _as_rrd(path: Path, folder: Path) -> Path:
+def _as_rrd(path: Path, folder: Path, recording: Path | None) -> Path:
     if path.suffix == ".rrd" and path.is_file():
         return path
     out = folder / f"{path.name or 'view'}.rrd"
@@ -63,10 +71,10 @@ def _as_rrd(path: Path, folder: Path) -> Path:
         made = path / "run.rrd"
         if made.is_file():
             return made
-        return write_rrd(path, RunFolder(path).recording, out)
+        return write_rrd(path, RunFolder(path).recording_at(recording), out)
     if (path / RECORDING_FILE).is_file():
-        recording = Recording(path)
-        return recording_to_rrd([recording.log(robot) for robot in recording.robots], out)
+        shown = Recording(path)
+        return recording_to_rrd([shown.log(robot) for robot in shown.robots], out)
     if path.suffix == ".mcap" and path.is_file():
         return recording_to_rrd([path], out)
     raise DuagError(
