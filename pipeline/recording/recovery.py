@@ -7,9 +7,11 @@ guessed: a message is kept as it was written or not at all.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import struct
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
@@ -50,6 +52,8 @@ def recover(source: Path, out: Path, force: bool = False) -> list[Salvage]:
         raise DuagError(f"{out}: exists already; choose another --out or give --force")
     if out.is_dir():
         raise DuagError(f"{out}: is a folder, expected the name of a log")
+    if out.exists() and out.samefile(source):
+        raise DuagError(f"{out}: is the damaged log itself, expected another name")
     return [_recover_log(source, out)]
 
 
@@ -77,7 +81,8 @@ def _recover_log(source: Path, out: Path) -> Salvage:
     except OSError as error:
         raise DuagError(f"{source}: {error.strerror or error}, expected to recover it to {out}") from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
     return salvage
 
 
@@ -192,12 +197,21 @@ def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
         warnings = [f"{RECORDING_FILE} was lost and made again from the logs"]
     salvaged = []
     for path in sorted(source.iterdir()):
-        if not path.is_file() or path.is_symlink() or not path.name.endswith((".mcap", ".mcap.part")):
+        if not path.name.endswith((".mcap", ".mcap.part")) or path.is_dir():
             continue
         try:
+            if not path.is_file() or path.is_symlink():
+                raise DuagError(f"{path}: is no file of this folder, expected a log")
             salvage = _recover_log(path, folder / path.name.removesuffix(".part"))
         except DuagError as error:
-            warnings.append(f"{path.name} is lost: {str(error).partition(': ')[2]}")
+            cause = error.__cause__
+            if (
+                isinstance(cause, OSError) and cause.errno != errno.EINVAL
+            ):  # the log may be whole: no room, no right
+                raise
+            reason = str(error).partition(": ")[2]
+            warnings.append(f"{path.name} is lost: {reason}")
+            salvaged.append(Salvage(path.name, damage=[reason]))
             continue
         salvaged.append(salvage)
         if not salvage.whole:

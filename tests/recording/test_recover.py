@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import struct
@@ -181,6 +182,27 @@ def test_a_recording_is_recovered_as_a_whole(tmp_path: Path) -> None:
     assert (rec / "alpha.mcap").stat().st_size == int(0.55 * len(data))
     with pytest.raises(DuagError, match="exists already"):
         recovery.recover(rec, tmp_path / "saved")
+
+
+def test_a_robot_whose_log_holds_nothing_is_said_to_be_lost(tmp_path: Path) -> None:
+    rec = large_recording(tmp_path / "rec")
+    (rec / "alpha.mcap").write_bytes(b"garbage")
+    result = CliRunner().invoke(app, ["recover", str(rec), "--out", str(tmp_path / "saved")])
+    assert result.exit_code == 3
+    assert "alpha.mcap: 0 messages" in result.stdout
+    assert Recording(tmp_path / "saved").robots == ["bravo"]
+
+
+def test_a_disk_that_is_full_saves_no_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = large_recording(tmp_path / "rec")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(recovery.os, "replace", full)
+    with pytest.raises(DuagError, match="No space left on device"):
+        recovery.recover(rec, tmp_path / "saved")
+    assert not (tmp_path / "saved").exists()
 
 
 def test_a_conversion_that_was_killed_is_saved(tmp_path: Path) -> None:
