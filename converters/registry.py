@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError, closest
+from duagc.pipeline.config.base import value_of
 
 # name on the command line -> module with `Options` and `convert(src, out, robots=, force=, **options)`
 DATASETS = {
@@ -131,10 +132,7 @@ def parse_options(options: Sequence[str]) -> dict[str, Any]:
         name, separator, text = option.partition("=")
         if not separator or not name.strip():
             raise DuagError(f"--set {option}: expected NAME=VALUE")
-        try:
-            values[name.strip()] = tomllib.loads(f"value = {text.strip()}")["value"]
-        except tomllib.TOMLDecodeError:
-            values[name.strip()] = text.strip()
+        values[name.strip()] = value_of(text, f"--set {name.strip()}")
     return values
 
 

@@ -329,6 +329,8 @@ def _check_output(workers: int, preview: Path | None) -> None:
     """Refuse a number of workers or a picture that cannot be."""
     if not 1 <= workers <= MAX_WORKERS:
         raise DuagError(f"simulate: workers is {workers}, expected 1 to {MAX_WORKERS}")
+    if preview is not None and preview.exists():
+        raise DuagError(f"{preview}: exists already, expected the name of a new picture")
     if preview is not None and (preview.suffix != ".png" or not preview.absolute().parent.is_dir()):
         raise DuagError(
             f"{preview}: found no such place for a picture, expected NAME.png in a folder that exists"

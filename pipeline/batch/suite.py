@@ -110,7 +110,7 @@ def read_suite(path: Path) -> Suite:
     """
     try:
         values = tomllib.loads(read_text(path, "a suite"))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise DuagError(f"{path}: not valid TOML: {error}") from error
     try:
         file = SuiteFile.model_validate(values)

@@ -190,8 +190,8 @@ def _content(path: Path) -> dict[str, Any]:
         return {"stamps_ns": trajectory.stamps_ns, "poses": trajectory.poses}
     try:
         return dict(json.loads(read_text(path, "a result of a run")))
-    except ValueError as error:
-        raise DuagError(f"{path}: not valid JSON: {error}") from error
+    except (ValueError, TypeError) as error:
+        raise DuagError(f"{path}: {error}, expected a JSON object") from error
 
 
 def _beyond(out: Compared, where: str, found: list[Unequal], tolerances: Tolerances) -> list[Unequal]:

@@ -26,11 +26,15 @@ def store(golden: Path, run: Path) -> None:
         run: folder of a finished run.
 
     Raises:
-        DuagError: it is no finished run, or the name is no .json.
+        DuagError: it is no finished run, or the name is not one for a golden run.
     """
     if golden.suffix != ".json":
         raise DuagError(f"{golden}: is a name without .json, expected that of a golden run")
+    if golden.exists() and not golden.with_suffix(".npz").is_file():
+        raise DuagError(f"{golden}: exists and is no golden run, expected one or a new name")
     found = summarize(run)
+    if not found.files:
+        raise DuagError(f"{run}: has no results of robots, expected a finished run")
     content = {
         "digest": found.digest,
         "files": found.files,
@@ -47,9 +51,9 @@ def store(golden: Path, run: Path) -> None:
     }
     arrays: dict[str, Any] = {f"{file} {topic}": t.messages for (file, topic), t in found.topics.items()}
     golden.parent.mkdir(parents=True, exist_ok=True)
-    with new_file(golden.with_suffix(".npz")) as part, part.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
-    with new_file(golden) as part:
+    with new_file(golden.with_suffix(".npz")) as arrays_part, new_file(golden) as part:
+        with arrays_part.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
         part.write_text(json.dumps(content, indent=1) + "\n")
 
 
@@ -81,6 +85,8 @@ def differences(golden: Path, run: Path) -> list[str]:
     """
     stored, metrics = _read(golden)
     found = summarize(run)
+    if not found.files:
+        raise DuagError(f"{run}: has no results of robots, expected a finished run")
     files = sorted({*stored.files, *found.files}, key=lambda file: (ORDER.index(stage_of(file)), file))
     lines = []
     for file in files:

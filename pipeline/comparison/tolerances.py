@@ -66,7 +66,7 @@ def read_tolerances(path: Path) -> Tolerances:
     """
     try:
         content = tomllib.loads(read_text(path, "a TOML file of tolerances"))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise DuagError(f"{path}: not valid TOML: {error}") from error
     rows = content.pop("tolerance", [])
     if content or not isinstance(rows, list):

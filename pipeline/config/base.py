@@ -17,7 +17,11 @@ class Config(BaseModel):
     LISTED: ClassVar[str] = "docs/reference/config.md"  # where users find its settings
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, use_attribute_docstrings=True
+        frozen=True,
+        extra="forbid",
+        validate_default=True,
+        use_attribute_docstrings=True,
+        allow_inf_nan=False,
     )
 
 
@@ -116,10 +120,28 @@ def _apply(values: dict[str, Any], override: str) -> None:
         values = values.setdefault(key, {})
         if not isinstance(values, dict):
             raise DuagError(f"--set {override}: {key} is a value, not a section")
+    values[keys[-1]] = value_of(text, f"--set {name}")
+
+
+def value_of(text: str, where: str) -> Any:
+    """A value in TOML notation; what is none is text.
+
+    Args:
+        text: of the value.
+        where: of messages.
+
+    Raises:
+        DuagError: it is several lines, or nested too deep.
+    """
+    text = text.strip()
+    if "\n" in text:
+        raise DuagError(f"{where}: found {len(text.splitlines())} lines, expected one value")
     try:
-        values[keys[-1]] = tomllib.loads(f"value = {text.strip()}")["value"]
+        return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
-        values[keys[-1]] = text.strip()
+        return text
+    except RecursionError as error:
+        raise DuagError(f"{where}: is nested too deep, expected a value") from error
 
 
 def dump_config(config: Config) -> str:

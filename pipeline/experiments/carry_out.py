@@ -23,7 +23,7 @@ from duagc.pipeline.batch.results import gather
 from duagc.pipeline.batch.suite import BatchCell, Suite, read_suite
 from duagc.pipeline.cache.code_identity import CodeReader
 from duagc.pipeline.config import packages
-from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.base import Config, load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.experiments.metric_names import names_in, needs_surface, needs_truth
@@ -37,6 +37,28 @@ RESULT, SUITE, RECORDINGS = "result.json", "suite.toml", "recordings"
 SIMULATED = "seed_"  # in front of the names of simulated recordings
 UNTIL = "evaluation"
 SIMULATOR = "duagc.converters.simulate.team:simulate"
+
+
+class ResultRows(Config):
+    """A run, as the result of an experiment has it; see `ResultRow`."""
+
+    recording: str
+    configuration: str
+    seed: int
+    values: dict[str, float | None]
+    reasons: dict[str, str]
+
+
+class ResultFile(Config):
+    """The result of an experiment."""
+
+    experiment: str = ""
+    rule_sha256: str
+    code_sha256: str | None = None
+    profile: str
+    seeds: list[int]
+    recordings: list[str]
+    rows: list[ResultRows]
 
 
 def check_recordings(experiments: Sequence[Experiment], recordings: Mapping[str, Path]) -> None:
@@ -135,11 +157,12 @@ def read_result(path: Path) -> dict[str, Any]:
     """
     try:
         found = json.loads(read_text(path, "the result of an experiment"))
-        if {"rule_sha256", "profile", "rows", "seeds", "recordings"} <= found.keys():
-            return dict(found)
-    except (ValueError, AttributeError):
-        pass
-    raise DuagError(f"{path}: is no result of an experiment, expected what `duagc experiment run` writes")
+        ResultFile.model_validate(found, strict=True)
+        return dict(found)
+    except (ValueError, RecursionError) as error:
+        raise DuagError(
+            f"{path}: is no result of an experiment, expected what `duagc experiment run` writes"
+        ) from error
 
 
 def recording_folder(out: Path, data: SimulatedData, seed: int, store: Path) -> Path:

@@ -69,6 +69,7 @@ def judge_folder(out: Path, rules: Path = RULES) -> list[JudgedExperiment]:
         result = read_result(path)
         experiment = read_experiment(path.parent.name, rules)
         check_rule(experiment, result, path)
+        experiment.profile(result["profile"])
         rows = rows_of(result)
         judged.append(
             JudgedExperiment(experiment, result, rows, judge(experiment.name, experiment.file, rows))
@@ -94,10 +95,11 @@ def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
         "counts": [counted(one.experiment, one.verdicts) for one in judged],
         "uses": _uses(judged),
     }
+    verdicts = {one.experiment.name: [_document(v) for v in one.verdicts] for one in judged}
+    verdicts_text = json.dumps(verdicts, indent=2, allow_nan=False) + "\n"
     _write(out / PAGE, filled(package, "page.html.j2", title="Experiments", **content))
     _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, **content))
-    verdicts = {one.experiment.name: [_document(v) for v in one.verdicts] for one in judged}
-    _write(out / VERDICTS, json.dumps(verdicts, indent=2, allow_nan=False) + "\n")
+    _write(out / VERDICTS, verdicts_text)
     write_costs(out, [one.experiment.name for one in judged])
 
 
