@@ -19,7 +19,7 @@ from duagc.converters.layouts.found_regions import FoundRegions
 from duagc.converters.layouts.validity import mask_of_user
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.camera import MAX_SIDE_PX, PinholeCamera
 from duagc.pipeline.recording import (
     DEPTH_SCALE_KEY,
     RANGE_SIGMA_KEY,
@@ -28,7 +28,7 @@ from duagc.pipeline.recording import (
 from duagc.schemas import topics
 
 NANOSECONDS = 1_000_000_000
-MAX_SIDE_PX, MAX_FOCAL_PX = 16_384, 1e6
+MAX_FOCAL_PX = 1e6
 FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
 SIGMA_SCALE_M = 1e-4  # of the images of standard deviations
 

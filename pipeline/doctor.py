@@ -131,7 +131,7 @@ def _disk(out: Path) -> Found:
     folder = Path(os.path.abspath(out))
     while not folder.exists():
         folder = folder.parent
-    if not os.access(folder, os.W_OK):
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
         remedy = "duagc run --out with a folder that you may write to"
         return Found("disk", "missing", f"{folder} cannot be written", "every run there", remedy)
     free = shutil.disk_usage(folder).free

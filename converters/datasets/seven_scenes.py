@@ -45,6 +45,7 @@ NO_DEPTH = (0, 65535)
 FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)")
 SEQUENCE_FOLDER = re.compile(r"seq-(\d+)")
 KINDS = ("color", "depth", "pose")
+MOST_NUMBERS = 10_000_000  # four days
 
 LENGTHS = {
     "color_distortion": (4, 5),
@@ -243,6 +244,10 @@ def list_frames(folder: Path) -> tuple[list[SevenScenesFrame], list[int]]:
     numbers = sorted(set().union(*files.values()))
     if not numbers:
         raise DuagError(f"{folder}: found no frame-NNNNNN.color.png or .jpg, expected a sequence of 7-Scenes")
+    if numbers[-1] - numbers[0] > MOST_NUMBERS:
+        raise DuagError(
+            f"{folder}: frame numbers from {numbers[0]} to {numbers[-1]}, expected at most {MOST_NUMBERS} of a sequence"
+        )
     kinds = KINDS if files["pose"] else KINDS[:2]
     for kind in kinds:
         for number in numbers:

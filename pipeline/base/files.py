@@ -61,6 +61,8 @@ def new_file(path: Path) -> Iterator[Path]:
     Raises:
         DuagError: it cannot be written there.
     """
+    if not path.name:
+        raise DuagError(f"{path}: found a path without a name, expected the name of a file")
     part = path.with_name(path.name + ".part")
     try:
         yield part

@@ -59,10 +59,14 @@ def main() -> None:
         print(f"duagc: {error}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
     except OSError as error:
-        if error.errno not in NO_ROOM:
+        if error.errno not in NO_ROOM and not error.filename:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        print(f"duagc: {where}{error.strerror}, expected room for the output", file=sys.stderr)
+        expected = ", expected room for the output" if error.errno in NO_ROOM else ""
+        print(f"duagc: {where}{error.strerror}{expected}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+    except KeyboardInterrupt:
+        print("duagc: interrupted", file=sys.stderr)
         sys.exit(EXIT_FAILED)
     except SystemExit as stop:
         if stop.code != TYPER_INTERRUPTED:

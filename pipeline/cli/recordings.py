@@ -147,6 +147,7 @@ def calibrate(
 
     determinism.configure_opencv()
     settings, recording = load_config(RunConfig, config, overrides or []), Recording(path)
+    recording.check_names()
     if out is not None:
         report.check_out(out, force, recording.description, path)
     with ExitStack() as place:

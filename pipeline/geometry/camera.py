@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+MAX_SIDE_PX = 16_384
+"""Of the images of any camera."""
+
 
 @dataclass(frozen=True)
 class PinholeCamera:

@@ -184,7 +184,7 @@ def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
         true = set()
         for line in read_text(file, "a pose graph").splitlines()[1:]:
             words = line.split(",")
-            if len(words) != 5 or not all(word.strip().isdigit() for word in words):
+            if len(words) != 5 or not all(word.strip().isdecimal() for word in words):
                 raise DuagError(
                     f"{file}: expected robot_src,pose_src,robot_dst,pose_dst,inlier, found {line!r}"
                 )

@@ -30,6 +30,7 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
@@ -125,7 +126,12 @@ def curvature_matrix(
 
 def factorized(H: sparse.csc_matrix) -> Callable[[Array], Array]:
     """Solver of H x = b for a symmetric positive definite sparse H."""
-    lu = sparse_linalg.splu(
-        H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
+    try:
+        lu = sparse_linalg.splu(
+            H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError as error:
+        raise DuagError(
+            f"pose graph: {error}: its numbers cannot be solved for, expected measurements of like size"
+        ) from error
     return lu.solve

@@ -11,6 +11,7 @@ from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_bytes
 from duagc.pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
+from duagc.pipeline.recording.read import log_metadata
 from duagc.schemas import topics
 
 
@@ -48,6 +49,17 @@ class Recording:
         if not path.is_file():
             raise DuagError(f"{path}: no such file, expected the log of {robot} that {RECORDING_FILE} names")
         return path
+
+    def check_names(self) -> None:
+        """Refuse a recording that has one robot's log as another's.
+
+        Raises:
+            DuagError: names the log, whose it is and whose it should be.
+        """
+        for robot in self.robots:
+            found = log_metadata(self.log(robot)).get("robot")
+            if found != robot:
+                raise DuagError(f"{self.log(robot)}: is the log of {found}, expected that of {robot}")
 
     @property
     def calibration(self) -> list[str]:

@@ -13,7 +13,7 @@ from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.geometry import masks, se3
-from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.camera import MAX_SIDE_PX, PinholeCamera
 from duagc.pipeline.geometry.open_shutter import OpenShutter
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.depth_sources import DepthImage, check_size, constant, depth_source
@@ -121,6 +121,10 @@ class RgbdLog:
     def _read_camera(self) -> PinholeCamera:
         topic = topic_table.CALIBRATION.of(self.robot)
         camera = constant(self._log, topic, messages.unpack_calibration)
+        if max(camera.width, camera.height) > MAX_SIDE_PX:
+            raise DuagError(
+                f"{self.path}: {topic} says {camera.width} x {camera.height} px, expected sides up to {MAX_SIDE_PX}"
+            )
         first, image = self._log.entries(topic)[0][0], self._log.entries(self._color_topic)[0][0]
         if first > image:
             raise DuagError(

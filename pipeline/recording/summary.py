@@ -112,6 +112,7 @@ def _topic_info(log: LogFile, topic: str) -> dict[str, Any]:
 
 def _recording_info(path: Path) -> dict[str, Any]:
     recording = Recording(path)
+    recording.check_names()
     out: dict[str, Any] = {"kind": "recording", **recording.description, "robots": {}}
     out["calibrated"] = recording.calibration
     out["warnings"] = warnings = list(recording.description.get("warnings", []))

@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.recording import content_digest
+from duagc.pipeline.recording import Recording, content_digest
 
 RESULT_SUFFIXES = (".mcap", ".ply", ".tum")
 TEAM_RESULTS = ("consensus.mcap", "exchange.mcap")
@@ -48,6 +48,9 @@ def digest(path: Path) -> str:
     if path.is_file():
         return digest_file(path)
     if (path / "recording.json").is_file():
+        recording = Recording(path)
+        for robot in recording.robots:
+            recording.log(robot)
         names = sorted(p.relative_to(path) for p in path.glob("*.mcap"))
     elif (path / "robots").is_dir():
         names = result_files(path)

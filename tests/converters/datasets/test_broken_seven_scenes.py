@@ -44,6 +44,7 @@ def write_image(name: str, array: np.ndarray) -> Callable[[Path], object]:
             "frame-000003.color.jpg: has no pose in the same folder",
         ),
         (lambda f: (f / "frame-000003.color.png").touch(), "frame-000003.color.png: found together with"),
+        (lambda f: (f / "frame-99999999999999999999.color.png").touch(), "frame numbers from 0 to 9999"),
         (
             lambda f: (f / "frame-000003.color.jpg").write_bytes(b""),
             "frame-000003.color.jpg: 0 bytes that no decoder",
