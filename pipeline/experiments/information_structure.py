@@ -47,8 +47,8 @@ class ShareRule(Config):
     name: str
     claim: str
     measure: str
-    least: float = -math.inf
-    most: float = math.inf
+    least: float = Field(-math.inf, allow_inf_nan=True)
+    most: float = Field(math.inf, allow_inf_nan=True)
     share: float = Field(gt=0.0, lt=1.0)
     control: bool = False
     """Known to be false: if it holds, the other verdicts are worthless."""
