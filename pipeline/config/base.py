@@ -25,6 +25,9 @@ class Config(BaseModel):
     )
 
 
+LARGEST = 2**62
+"""Of numbers; as nanoseconds 146 years."""
+
 Model = TypeVar("Model", bound=Config)
 
 
@@ -49,7 +52,9 @@ def load_config(model: type[Model], path: Path | None = None, overrides: Sequenc
     for override in overrides:
         _apply(values, override)
     try:
-        return model.model_validate(values)
+        config = model.model_validate(values)
+        _check_numbers(config, source)
+        return config
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
@@ -61,6 +66,22 @@ def load_config(model: type[Model], path: Path | None = None, overrides: Sequenc
         if first["type"] == "value_error":
             raise DuagError(f"{source}: {first['ctx']['error']}") from error
         raise DuagError(f"{source}: {name} = {first['input']!r}: {first['msg']}") from error
+
+
+def _check_numbers(config: Config, source: str, prefix: str = "") -> None:
+    """Refuse numbers below 0 where a setting says nothing else, numbers that no machine holds, and lists of none."""
+    for name, field in type(config).model_fields.items():
+        value, where = getattr(config, name), f"{source}: {prefix}{name}"
+        if isinstance(value, tuple) and not value and field.default:
+            raise DuagError(f"{where} is empty, expected one value or more")
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, Config):
+                _check_numbers(number, source, f"{prefix}{name}.")
+            elif isinstance(number, int | float):
+                if number < 0 and not field.metadata:
+                    raise DuagError(f"{where} is {number:g}, expected 0 or more")
+                if abs(number) > LARGEST:
+                    raise DuagError(f"{where} is {float(number):.3g}, expected at most {LARGEST:g}")
 
 
 def _nearest(model: type[Config], path: Sequence[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, PositiveInt
 
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.consensus import LoopClosureConfig
@@ -268,7 +268,7 @@ class TrackingConfig(Config):
     """A registration that moves less than this from its start stays there."""
     stable_rad: float = 0.01
     """The same for the rotation."""
-    strides: tuple[int, ...] = (4, 2, 1, 1)
+    strides: tuple[PositiveInt, ...] = (4, 2, 1, 1)
     """Pixels between samples of a keyframe, per pyramid level, finest first."""
     max_extrapolation_s: float = 0.2
     """Longest gap in time over which the last velocity predicts."""
@@ -306,7 +306,7 @@ class ModelConfig(Config):
     """The map is drawn at the image size halved until it has no more pixels: half of 640 x 480, but 320 x 240 whole."""
     min_alpha: float = 0.9
     """Opacity of the drawn map below which a pixel is not used."""
-    strides: tuple[int, ...] = (2, 2, 1)
+    strides: tuple[PositiveInt, ...] = (2, 2, 1)
     """Pixels between samples of the drawn map, finest level first."""
 
 

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, PositiveInt
 
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.training import DepthKind, LearningRates, MapLossConfig, SparseStepsConfig
@@ -14,7 +14,7 @@ THICKNESS_FLOOR_M = 1e-3
 class SeedingConfig(Config):
     """Where Gaussians are inserted and what they look like at first."""
 
-    cell_sizes_px: tuple[int, ...] = (8, 4, 2)
+    cell_sizes_px: tuple[PositiveInt, ...] = (8, 4, 2)
     """Sides of the quadtree's cells, coarse to fine, each half of the one before."""
     detail: float = 0.02
     """Standard deviation of gray (0..1) in a cell above which it is split; raised until the budget holds."""
