@@ -45,7 +45,7 @@ def bench_raster(
     plan = raster.RasterPlan(
         sizes=tuple(sizes_of(sizes)),
         gaussians=tuple(counts("--gaussians", "60k,300k,1M" if full else gaussians)),
-        threads=tuple(counts("--threads", threads)),
+        threads=tuple(counts("--threads", threads, MOST_THREADS)),
         rounds=max(rounds, 15) if full else rounds,
         torch_too=not no_torch,
         isas=tuple(isas),
@@ -94,7 +94,7 @@ def bench_consensus(
             if word not in known:
                 raise typer.BadParameter(f"{word!r} is not one of {', '.join(known)}", param_hint=option)
     plan = consensus_modes.ConsensusPlan(
-        robots=tuple(counts("--robots", robots)),
+        robots=tuple(counts("--robots", robots, MOST_ROBOTS)),
         topologies=tuple(topology.split(",")),
         losses=tuple(numbers("--loss", loss, 0.0, 0.99)),
         contrasts=tuple(numbers("--contrast", contrast, 1.0, 1e8)),
@@ -280,7 +280,7 @@ def bench_paths(
             raise typer.BadParameter(
                 f"{name!r} is not one of {', '.join(PARADIGMS[1:])}", param_hint="--paradigms"
             )
-    teams = counts("--robots", robots)
+    teams = counts("--robots", robots, MOST_ROBOTS)
     if max(teams) > MAX_ROBOTS:
         raise typer.BadParameter(f"{max(teams)} is more than {MAX_ROBOTS}", param_hint="--robots")
     asked = numbers("--overlap", overlap, 0, 1)
@@ -326,11 +326,11 @@ def numbers(option: str, text: str, low: float, high: float) -> list[float]:
     return numbers
 
 
-LARGEST_PX = 16_384
+LARGEST_PX, MOST_THREADS, MOST_ROBOTS = 16_384, 1024, 64
 
 
-def counts(option: str, text: str) -> list[int]:
-    """Positive numbers out of text like 60k,1M."""
+def counts(option: str, text: str, most: int = 10**9) -> list[int]:
+    """Positive numbers, up to one, out of text like 60k,1M."""
     counts = []
     for word in text.split(","):
         digits, unit = (word[:-1], word[-1]) if word[-1:] in ("k", "M") else (word, "")
@@ -339,6 +339,8 @@ def counts(option: str, text: str) -> list[int]:
                 f"{word!r} is not a positive number, such as 2, 60k or 1M", param_hint=option
             )
         counts.append(int(digits) * {"": 1, "k": 1000, "M": 1_000_000}[unit])
+        if counts[-1] > most:
+            raise typer.BadParameter(f"{word!r} is more than {most}", param_hint=option)
     return counts
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from duagc.pipeline.cli.bench import counts, numbers
+from duagc.pipeline.cli.bench import MOST_ROBOTS, MOST_THREADS, counts, numbers
 from duagc.pipeline.cli.common import Json, Overrides, bench_app
 
 Recorded = Annotated[Path, typer.Argument(help="Folder of a recording.", show_default=False)]
@@ -26,7 +26,7 @@ def bench_realtime(
         typer.Option(help="`duagc` of another version, which runs the same in turn.", show_default=False),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="Of every log; else all of it.", show_default=False)
+        float | None, typer.Option(min=0.1, max=1e6, help="Of every log; else all of it.", show_default=False)
     ] = None,
     no_open3d: Annotated[bool, typer.Option("--no-open3d", help="Without Open3D's odometry.")] = False,
     no_evaluation: Annotated[
@@ -49,8 +49,8 @@ def bench_realtime(
         raise typer.BadParameter("other versions may not know it", param_hint="--no-evaluation")
     plan = realtime.RealtimePlan(
         recording,
-        tuple(counts("--robots", robots)),
-        tuple(counts("--threads", threads)),
+        tuple(counts("--robots", robots, MOST_ROBOTS)),
+        tuple(counts("--threads", threads, MOST_THREADS)),
         other=other,
         open3d=not no_open3d,
         seconds=seconds,

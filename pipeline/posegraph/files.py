@@ -182,7 +182,12 @@ def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
     inlier = np.zeros(len(edges.i), dtype=bool)
     if file.suffix == ".csv":
         true = set()
-        for line in read_text(file, "a pose graph").splitlines()[1:]:
+        head, *lines = read_text(file, "a pose graph").splitlines() or [""]
+        if len(head.split(",")) != 5 or head.replace(",", "").strip().isdecimal():
+            raise DuagError(
+                f"{file}: begins with {head[:60]!r}, expected robot_src,pose_src,robot_dst,pose_dst,inlier"
+            )
+        for line in lines:
             words = line.split(",")
             if len(words) != 5 or not all(word.strip().isdecimal() for word in words):
                 raise DuagError(
