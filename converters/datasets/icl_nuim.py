@@ -29,7 +29,7 @@ S = np.diag([1.0, -1.0, 1.0, 1.0])
 class Options(image_folder.LengthOptions):
     """Time and numbering."""
 
-    rate_hz: int = Field(30, gt=0)
+    rate_hz: int = Field(30, gt=0, le=1000)
     """Frames per second; the dataset numbers its frames."""
     first_pose: Literal["auto", "0", "1"] = "auto"
     """Number of the pose of image 0: some archives count images from 0 and poses from 1. auto: 0 if every image then

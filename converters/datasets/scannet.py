@@ -26,7 +26,7 @@ DEPTH_SCALE = 0.001
 class Options(image_folder.LengthOptions):
     """Time; exported scans have none."""
 
-    rate_hz: int = Field(30, gt=0)
+    rate_hz: int = Field(30, gt=0, le=1000)
     """Frames per second."""
 
 

@@ -28,7 +28,7 @@ OPENCV_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 class Options(image_folder.LengthOptions):
     """Time and choice of images."""
 
-    rate_hz: int = Field(1, gt=0)
+    rate_hz: int = Field(1, gt=0, le=1000)
     """Frames per second; photographs have none."""
     bad: bool = False
     """Take images too that the dataset marks as bad."""

@@ -82,7 +82,7 @@ class Options(LengthOptions):
     depth_correction_per_m: str = ""
     """Smooth error of the depth camera, c0 .. c5: 1/z + c0 (1 - 2 m / z) + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 is
     the true 1/z at the ray (x, y, 1); empty: none."""
-    rate_hz: int = Field(30, gt=0)
+    rate_hz: int = Field(30, gt=0, le=1000)
     """Frames per second; the dataset has no time stamps."""
     reference_poses: str = ""
     """File of true poses to take instead of the dataset's, by structure from motion: a line per image, in the format of

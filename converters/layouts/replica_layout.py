@@ -28,7 +28,7 @@ FILE = re.compile(r"(frame|depth)(\d+)\.(jpg|jpeg|png)")
 class LayoutOptions(Config):
     """Time; the dataset has none."""
 
-    rate_hz: int = Field(30, gt=0)
+    rate_hz: int = Field(30, gt=0, le=1000)
     """Frames per second; the dataset has no time stamps."""
     frame_limit: int = Field(0, ge=0)
     """Most frames of each part; 0: all. Published runs on Office-0 of ReplicaMultiagent stop at 1500."""

@@ -33,9 +33,9 @@ class AssociationOptions(Config):
     it by the motion of the camera. `official`: closest pairs first, each image once, as the dataset's associate.py.
     `nearest`: for each color image the nearest depth image, which may be used twice, as most published loaders do. Both
     take depth as of the time of color."""
-    max_difference_s: float = Field(0.0, ge=0.0)
+    max_difference_s: float = Field(0.0, ge=0.0, le=3600.0)
     """Largest difference of their times; 0: 0.1 for `all`, 0.02 for `official`, 0.08 for `nearest`."""
-    max_pose_gap_s: float = Field(0.1, gt=0.0)
+    max_pose_gap_s: float = Field(0.1, gt=0.0, le=3600.0)
     """Poses are interpolated between two measured ones that are no further apart; never beyond the ends."""
 
     @property
