@@ -35,7 +35,7 @@ def batch(
     from duagc.pipeline.batch.engines import engine_of
     from duagc.pipeline.batch.results import PAGE, TABLE, gather
     from duagc.pipeline.batch.suite import read_suite
-    from duagc.pipeline.cache.store import default_store
+    from duagc.pipeline.cache.store import Store, default_store
 
     if engine not in ("local", "slurm", "ray"):
         raise typer.BadParameter(f"{engine!r} is not one of local, slurm, ray", param_hint="--engine")
@@ -46,8 +46,10 @@ def batch(
         return
     if out.exists() and not out.is_dir():
         raise DuagError(f"{out}: is no folder, expected that of a batch")
+    place = store or default_store(out / "run")
+    Store(place)  # what is none is refused before a cell begins
     with engine_of(engine, workers, out) as chosen:
-        run_batch(read, out, store or default_store(out / "run"), chosen, log=say)
+        run_batch(read, out, place, chosen, log=say)
     done = gather(read, out)
     states = {name: vars(read_state(out, name)) for name in read.cells}
     failed = [name for name, state in states.items() if state["state"] != "done"]

@@ -86,7 +86,7 @@ def run(
     `duagc experiment run h1_team --recording kitchen=recordings/redkitchen --out outputs/h1`
     """
     from duagc.pipeline.batch.engines import engine_of
-    from duagc.pipeline.cache.store import default_store
+    from duagc.pipeline.cache.store import Store, default_store
     from duagc.pipeline.experiments.carry_out import carry_out, check_packages, check_place, check_recordings
     from duagc.pipeline.experiments.pages import PAGE, judge_folder, write_report
     from duagc.pipeline.experiments.predicted import predicted_each_s, time_left_s
@@ -103,6 +103,8 @@ def run(
         check_packages(experiment, profile)
         check_place(experiment, profile, out)
     check_recordings(chosen, recordings)
+    place = store or default_store(out / "run")
+    Store(place)  # what is none is refused before anything is simulated
     failed: list[str] = []
     took_s: list[float] = []
     predicted_s = predicted_each_s(chosen, profile)
@@ -120,7 +122,7 @@ def run(
                 out,
                 recordings=recordings,
                 engine=opened,
-                store=store or default_store(out / "run"),
+                store=place,
                 log=say,
             )
         took_s.append(time.monotonic() - begun)

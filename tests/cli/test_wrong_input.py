@@ -73,6 +73,7 @@ def test_another_recording_is_not_that_of_a_run(fake, tmp_path, command) -> None
         ("run", "{recording}", "--out", "{tmp}/run", "--set", f"frontend.mapping.iterations={10**24}"),
         ("run", "{recording}", "--out", "{tmp}/mine.png/run"),
         ("batch", "{tmp}/mine.png", "--out", "{tmp}/b"),
+        ("experiment", "run", "h1_team", "--out", "{tmp}/e", "--store", "{tmp}/mine.png"),
     ],
     ids=lambda words: " ".join(words)[:60],
 )
