@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, SupportsIndex
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.component_names import component_name
-from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Hear
 
@@ -66,8 +65,7 @@ def check_log(log: Path, robot: str) -> dict[str, int]:
 
     determinism.configure_opencv()
     with open_rgbd(log) as camera:
-        if camera.robot != robot:
-            raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
+        camera.check_robot(robot)
         return {
             "frames": len(camera),
             "pixels": camera.camera.width * camera.camera.height,

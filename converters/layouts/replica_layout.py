@@ -16,16 +16,15 @@ import numpy as np
 from pydantic import Field
 
 from duagc.converters.layouts.image_files import options_of, rigid
-from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of, write
+from duagc.converters.layouts.image_folder import Clip, FrameFiles, LengthOptions, stamps_of, write
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
-from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 FILE = re.compile(r"(frame|depth)(\d+)\.(jpg|jpeg|png)")
 
 
-class LayoutOptions(Config):
+class LayoutOptions(LengthOptions):
     """Time; the dataset has none."""
 
     rate_hz: int = Field(30, gt=0, le=1000)
@@ -146,8 +145,7 @@ def read_part(
         raise DuagError(f"{path}: has {len(poses)} poses, expected one for frame {numbers[-1]} as well")
     if len(poses) != numbers[-1] + 1:
         warnings.append(f"{label or folder.name}: {len(poses)} poses for frames up to {numbers[-1]}")
-    if options.frame_limit:
-        numbers = numbers[: options.frame_limit]
+    numbers = options.first(numbers)
     stamps = stamps_of(numbers, options.rate_hz)
     frames = [
         FrameFiles(n, stamp, color[n], depth[n], poses[n]) for n, stamp in zip(numbers, stamps, strict=True)

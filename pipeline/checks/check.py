@@ -48,8 +48,8 @@ def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = N
         try:
             log = recording.log(robot) if recording else path
             with open_rgbd(log) as rgbd:
-                if recording and rgbd.robot != robot:
-                    raise DuagError(f"{log}: is the log of {rgbd.robot}, expected that of {robot}")
+                if recording:
+                    rgbd.check_robot(robot)
                 _check_robot(report, recording, rgbd, sights, config=config)
         except DuagError as error:
             advice = "duagc recover may save it" if log else ""

@@ -35,6 +35,7 @@ def bench_raster(
     """
     from duagc.pipeline.bench import raster, raster_tables
     from duagc.pipeline.kernels import available_isas
+    from duagc.pipeline.kernels.rasterizer import MAX_THREADS
 
     isas = available_isas() if isa is None else isa.split(",")
     for name in isas:
@@ -45,7 +46,7 @@ def bench_raster(
     plan = raster.RasterPlan(
         sizes=tuple(sizes_of(sizes)),
         gaussians=tuple(counts("--gaussians", "60k,300k,1M" if full else gaussians)),
-        threads=tuple(counts("--threads", threads, MOST_THREADS)),
+        threads=tuple(counts("--threads", threads, MAX_THREADS)),
         rounds=max(rounds, 15) if full else rounds,
         torch_too=not no_torch,
         isas=tuple(isas),
@@ -326,7 +327,7 @@ def numbers(option: str, text: str, low: float, high: float) -> list[float]:
     return numbers
 
 
-LARGEST_PX, MOST_THREADS, MOST_ROBOTS = 16_384, 1024, 64
+LARGEST_PX, MOST_ROBOTS = 16_384, 64
 
 
 def counts(option: str, text: str, most: int = 10**9) -> list[int]:

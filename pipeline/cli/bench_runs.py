@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from duagc.pipeline.cli.bench import MOST_ROBOTS, MOST_THREADS, counts, numbers
+from duagc.pipeline.cli.bench import MOST_ROBOTS, counts, numbers
 from duagc.pipeline.cli.common import Json, Overrides, bench_app
 
 Recorded = Annotated[Path, typer.Argument(help="Folder of a recording.", show_default=False)]
@@ -44,13 +44,14 @@ def bench_realtime(
     `duagc bench realtime recordings/redkitchen --robots 2 --threads 2 --other ../before/.venv/bin/duagc`
     """
     from duagc.pipeline.bench import realtime
+    from duagc.pipeline.kernels.rasterizer import MAX_THREADS
 
     if no_evaluation and other is not None:
         raise typer.BadParameter("other versions may not know it", param_hint="--no-evaluation")
     plan = realtime.RealtimePlan(
         recording,
         tuple(counts("--robots", robots, MOST_ROBOTS)),
-        tuple(counts("--threads", threads, MOST_THREADS)),
+        tuple(counts("--threads", threads, MAX_THREADS)),
         other=other,
         open3d=not no_open3d,
         seconds=seconds,

@@ -39,16 +39,6 @@ UNTIL = "evaluation"
 SIMULATOR = "duagc.converters.simulate.team:simulate"
 
 
-class ResultRows(Config):
-    """A run, as the result of an experiment has it; see `ResultRow`."""
-
-    recording: str
-    configuration: str
-    seed: int
-    values: dict[str, float | None]
-    reasons: dict[str, str]
-
-
 class ResultFile(Config):
     """The result of an experiment."""
 
@@ -58,7 +48,7 @@ class ResultFile(Config):
     profile: str
     seeds: list[int]
     recordings: list[str]
-    rows: list[ResultRows]
+    rows: list[ResultRow]
 
 
 def check_recordings(experiments: Sequence[Experiment], recordings: Mapping[str, Path]) -> None:
@@ -156,25 +146,24 @@ def read_result(path: Path) -> dict[str, Any]:
         DuagError: it is none.
     """
     try:
-        found = json.loads(read_text(path, "the result of an experiment"))
-        ResultFile.model_validate(found, strict=True)
-        return dict(found)
+        text = read_text(path, "the result of an experiment")
+        ResultFile.model_validate_json(text, strict=True)
+        return dict(json.loads(text))
     except (ValueError, RecursionError) as error:
         raise DuagError(
             f"{path}: is no result of an experiment, expected what `duagc experiment run` writes"
         ) from error
 
 
-def recording_folder(out: Path, data: SimulatedData, seed: int, store: Path) -> Path:
+def recording_folder(out: Path, data: SimulatedData, seed: int, simulator: str) -> Path:
     """Folder of a simulated recording; experiments with the same data share it, simulators that differ do not.
 
     Args:
         out: folder of all experiments.
         data: what is simulated.
         seed: of it.
-        store: of what was computed before, which remembers digests.
+        simulator: digest of its code.
     """
-    simulator = _digest_of([SIMULATOR], store)
     digest = hashlib.sha256(f"{simulator}\n{data.model_dump_json()}".encode()).hexdigest()[:12]
     return out / RECORDINGS / f"{digest}-{seed}"
 
@@ -201,12 +190,13 @@ def prepare(
     Raises:
         DuagError: a recording cannot be read.
     """
+    simulator = simulator_digest(store)
     folders, own = dict[str, Path](), dict[str, tuple[int, SimulatedData]]()
     for data in dict.fromkeys(
         data_of(experiment.file, profile, name) for name in experiment.file.configurations
     ):
         for seed in profile.seeds:
-            folder = recording_folder(out, data, seed, store)
+            folder = recording_folder(out, data, seed, simulator)
             name = f"{SIMULATED}{seed}" + ("" if data == profile.data else f".{folder.name.split('-')[0]}")
             folders[name], own[name] = folder, (seed, data)
             if not folder.exists():
@@ -314,6 +304,15 @@ def code_digest(store: Path) -> str:
     """
     used = stages.STAGES[: 1 + stages.STAGES.index(stages.EVALUATION)]
     return _digest_of([SIMULATOR, *(stage.code for stage in used)], store)
+
+
+def simulator_digest(store: Path) -> str:
+    """Digest of the simulator, with all that it imports.
+
+    Args:
+        store: of what was computed before, which remembers digests.
+    """
+    return _digest_of([SIMULATOR], store)
 
 
 def _digest_of(functions: Sequence[str], store: Path) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from pydantic import ConfigDict
+
 from duagc.pipeline.base.random_streams import generator
 from duagc.pipeline.experiments.rule import ExperimentFile, Rule, RuleSide
 from duagc.pipeline.experiments.statistics import (
@@ -33,6 +35,8 @@ class ResultRow:
         values: by metric; None: absent.
         reasons: why, of absent ones.
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)  # of rows that are read
 
     recording: str
     configuration: str

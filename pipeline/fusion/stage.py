@@ -28,6 +28,7 @@ from duagc.pipeline.fusion.peer_validation import PeerCheck, ValidatedPeers, val
 from duagc.pipeline.fusion.peer_views import peer_views
 from duagc.pipeline.fusion.stated_scale import stated_scale
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.surface_distance import DepthView
 from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
@@ -191,13 +192,13 @@ def _untrained(
         color_sigma=own.information.color_sigma,
         pixels_per_sample=own.information.color_pixels_per_sample,
     )
-    if not context.config.stated_scale.enabled or context.weights not in STATED_KINDS:
+    stated = context.config.stated_scale
+    if not stated.enabled or context.weights not in STATED_KINDS:
         return valid, fused
-    seen = ShelvedList(DepthView(view.usable_depth, view.T_world_camera) for view in views)
+    some = (views[k] for k in evenly_spaced(len(views), min(stated.views, len(views))))
+    seen = ShelvedList(DepthView(view.usable_depth, view.T_world_camera) for view in some)
     peers = valid.uncontradicted.values()
-    return valid, replace(
-        fused, stated_scale=stated_scale(peers, own.camera, seen, context.config.stated_scale)
-    )
+    return valid, replace(fused, stated_scale=stated_scale(peers, own.camera, seen, stated))
 
 
 def _finetuned(

@@ -16,7 +16,6 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.fusion import StatedScaleConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.surface_distance import DepthView, median_distances
 from duagc.pipeline.splat.information import MEAN, gaussians_of, sigma_along
 
@@ -39,10 +38,8 @@ def stated_scale(
         views: its own depth images.
         config: which Gaussians count, the share, the bounds.
     """
-    some = [views[k] for k in evenly_spaced(len(views), min(config.views, len(views)))]
-    asked = sorted(
-        f for peer in peers if (f := _asked(_ratios(peer, camera, some, config), config)) is not None
-    )
+    ratios = (_ratios(peer, camera, views, config) for peer in peers)
+    asked = sorted(factor for some in ratios if (factor := _asked(some, config)) is not None)
     if not asked:
         return 1.0
     return min(max(1.0, asked[(len(asked) - 1) // 2]), config.most)

@@ -11,7 +11,7 @@ from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_bytes
 from duagc.pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
-from duagc.pipeline.recording.read import log_metadata
+from duagc.pipeline.recording.rgbd import open_rgbd
 from duagc.schemas import topics
 
 
@@ -57,9 +57,8 @@ class Recording:
             DuagError: names the log, whose it is and whose it should be.
         """
         for robot in self.robots:
-            found = log_metadata(self.log(robot)).get("robot")
-            if found != robot:
-                raise DuagError(f"{self.log(robot)}: is the log of {found}, expected that of {robot}")
+            with open_rgbd(self.log(robot)) as log:
+                log.check_robot(robot)
 
     @property
     def calibration(self) -> list[str]:

@@ -166,6 +166,18 @@ class RgbdLog:
                 )
         return at
 
+    def check_robot(self, robot: str) -> None:
+        """Refuse the log of another robot.
+
+        Args:
+            robot: whose it should be.
+
+        Raises:
+            DuagError: it is another one's.
+        """
+        if self.robot != robot:
+            raise DuagError(f"{self.path}: is the log of {self.robot}, expected that of {robot}")
+
     def __len__(self) -> int:
         return len(self.pairing.pairs)
 

@@ -230,8 +230,7 @@ def load(source: AgentInput) -> RobotData:
     poses = np.array([k.T_map_camera for k in keyframes], dtype=np.float64).reshape(-1, 4, 4)
     with open_rgbd(source.log) as log:
         camera = log.camera
-        if log.robot != robot_of(robot):
-            raise DuagError(f"{source.log}: is the log of {log.robot}, expected that of {robot_of(robot)}")
+        log.check_robot(robot_of(robot))
 
     return RobotData(
         robot,

@@ -22,6 +22,7 @@ from duagc.pipeline.experiments.carry_out import (
     code_digest,
     prepare,
     recording_folder,
+    simulator_digest,
 )
 from duagc.pipeline.experiments.pages import MARKDOWN, PAGE, VERDICTS, judge_folder, write_report
 from duagc.pipeline.experiments.rule import read_experiment
@@ -68,7 +69,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fake = fake_run.make(root / "fake")
     for seed in range(6):  # recordings that are there already
         with _small_code():
-            there = recording_folder(root / "out", data, seed, root / "store")
+            there = recording_folder(root / "out", data, seed, simulator_digest(root / "store"))
         shutil.copytree(fake.recording, there)
     _carry_out(root, Measured("seed_5-lossy-5"))
     return root
@@ -131,7 +132,7 @@ def test_another_simulator_takes_no_recordings_of_the_one_before(place: Path, tm
     for simulator in ("DuagError", "closest", "DuagError"):
         with pytest.MonkeyPatch.context() as patch:
             _only_stage(patch, "closest", simulator)
-            folders.append(recording_folder(tmp_path, data, 0, tmp_path / "store"))
+            folders.append(recording_folder(tmp_path, data, 0, simulator_digest(tmp_path / "store")))
     assert folders[0] == folders[2] != folders[1]
 
 

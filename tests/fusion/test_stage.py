@@ -229,15 +229,17 @@ def test_a_neighbor_far_from_own_images_raises_what_is_stated_of_positions(robot
     source = AgentInput("bravo", robot.log, robot.frontend, robot.information, 1e-3)
     training = FinetuneConfig(steps_per_view=0)
     maps = []
-    for enabled, weights in ((False, "block"), (True, "block"), (True, "uniform")):
-        stated = StatedScaleConfig(enabled=enabled, min_views=2)
+    cases = ((False, 128, "block"), (True, 128, "block"), (True, 128, "uniform"), (True, 1, "block"))
+    for enabled, most_views, weights in cases:
+        stated = StatedScaleConfig(enabled=enabled, min_views=2, views=most_views)
         config = FusionConfig(explained_opacity=0.0, finetune=training, stated_scale=stated)
         result = result_of(robot, still.T_map_keyframe, alpha=other)
         run_fusion(source, result, tmp_path, **SETTINGS | {"config": config, "weights": weights})
         (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.FUSED_MAP.of("bravo")])
         maps.append(record.message())
-    before, after, uniform = (m.information for m in maps)
+    before, after, uniform, of_one_view = (m.information for m in maps)
     assert before.stated_scale == uniform.stated_scale == 1.0  # weights that are uniform state nothing
+    assert of_one_view.stated_scale == 1.0  # two views must have measured a surface
     assert 1.5 < after.stated_scale < 4.0  # 4 standard deviations; some of the errors are those of the poses
     positions = [0, 1, 2, 9, 10, 17]  # in the upper triangle of 9x9
     np.testing.assert_allclose(

@@ -93,12 +93,6 @@ def test_a_peer_that_claims_too_much_makes_no_map_uncertain():
     assert stated_scale([liar], CAMERA, of_wall(), CONFIG) == CONFIG.most
 
 
-def test_of_many_views_some_are_looked_at():
-    views = of_wall() * 50
-    few = CONFIG.model_copy(update={"views": 4})
-    assert stated_scale([peer(errors(2.0))], CAMERA, views, few) == pytest.approx(2.0, rel=0.05)
-
-
 def test_gaussians_that_state_nothing_do_not_count():
     whole = peer(errors(2.0))
     information = whole.information.copy()
