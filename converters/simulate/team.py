@@ -54,6 +54,7 @@ def simulate(
     covers: Sequence[Cover] = (),
     degradations: Degradations | None = None,
     triangles: bool = False,
+    paths: Sequence[Array] | None = None,
 ) -> None:
     """Render a recording of a robot team, with exact depth, poses and geometry as ground truth.
 
@@ -81,6 +82,7 @@ def simulate(
         degradations: what makes the camera worse than an ideal one; None: nothing.
         triangles: make triangles of the room even if nothing needs them: its paths are then those of recordings
             that do.
+        paths: T_world_camera [frames, 4, 4] of every robot, instead of those of the paradigm.
     Raises:
         DuagError: an argument is out of range, `out` exists, or a mesh cannot be used.
     """
@@ -103,6 +105,7 @@ def simulate(
     )
     settings.check()
     _check_output(workers, preview)
+    _check_paths(settings, paths)
     determinism.configure_determinism()
     determinism.configure_opencv()
     source, parameters = scene_of(scene, up)
@@ -111,7 +114,7 @@ def simulate(
             out,
             source=source,
             converter="simulate",
-            parameters=parameters | settings.parameters(),
+            parameters=parameters | settings.parameters() | ({} if paths is None else {"paths": "given"}),
             force=force,
         ) as recording,
         tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache,
@@ -119,7 +122,7 @@ def simulate(
         simulated = set_up(
             scene, parameters.get("up", ""), seed, Path(cache), as_meshes=settings.needs_triangles
         )
-        team = _Team(settings, simulated, camera_of(size))
+        team = _Team(settings, simulated, camera_of(size), paths)
         shared = team.report_paths(recording)
         points = simulated.points()
         recording.add_geometry(lambda path: write_points(path, *points))
@@ -140,10 +143,16 @@ def simulate(
 class _Team:
     """The robots of a simulation: their names and trajectories, and what a recording says about them."""
 
-    def __init__(self, settings: SimulationSettings, scene: SimulatedScene, camera: PinholeCamera) -> None:
+    def __init__(
+        self,
+        settings: SimulationSettings,
+        scene: SimulatedScene,
+        camera: PinholeCamera,
+        paths: Sequence[Array] | None,
+    ) -> None:
         self.settings, self.scene, self.camera = settings, scene, camera
         self.names = robot_names(settings.robots)
-        self.trajectories = self._plan()
+        self.trajectories = self._plan() if paths is None else list(paths)
         """T_world_camera [frames, 4, 4] of every robot."""
         self._clocks_ns = {name: settings.rig.clock_offset_ns(settings.seed, name) for name in self.names}
         self._twists = [twists_of(path) for path in self.trajectories]
@@ -323,6 +332,13 @@ def _movers(
     return walk(
         settings.movers, scene.free_space(), scene.caster, trajectories, seed=settings.seed, cache=cache
     )
+
+
+def _check_paths(settings: SimulationSettings, paths: Sequence[Array] | None) -> None:
+    """Refuse paths that are not one pose a frame of every robot."""
+    expected = [(settings.frames, 4, 4)] * settings.robots
+    if paths is not None and (found := [path.shape for path in paths]) != expected:
+        raise DuagError(f"simulate: paths are of shapes {found}, expected {expected}")
 
 
 def _check_output(workers: int, preview: Path | None) -> None:
