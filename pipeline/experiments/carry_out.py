@@ -37,6 +37,7 @@ RESULT, SUITE, RECORDINGS = "result.json", "suite.toml", "recordings"
 SIMULATED = "seed_"  # in front of the names of simulated recordings
 UNTIL = "evaluation"
 SIMULATOR = "duagc.converters.simulate.team:simulate"
+STEERING = "duagc.pipeline.experiments.steering:simulate_steered"
 
 
 class ResultFile(Config):
@@ -155,16 +156,16 @@ def read_result(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def recording_folder(out: Path, data: SimulatedData, seed: int, simulator: str) -> Path:
+def recording_folder(out: Path, data: SimulatedData, seed: int, made_by: str) -> Path:
     """Folder of a simulated recording; experiments with the same data share it, simulators that differ do not.
 
     Args:
         out: folder of all experiments.
         data: what is simulated.
         seed: of it.
-        simulator: digest of its code.
+        made_by: digest of what makes it.
     """
-    digest = hashlib.sha256(f"{simulator}\n{data.model_dump_json()}".encode()).hexdigest()[:12]
+    digest = hashlib.sha256(f"{made_by}\n{data.model_dump_json()}".encode()).hexdigest()[:12]
     return out / RECORDINGS / f"{digest}-{seed}"
 
 
@@ -190,19 +191,19 @@ def prepare(
     Raises:
         DuagError: a recording cannot be read.
     """
-    simulator = simulator_digest(store)
     folders, own = dict[str, Path](), dict[str, tuple[int, SimulatedData]]()
     for data in dict.fromkeys(
         data_of(experiment.file, profile, name) for name in experiment.file.configurations
     ):
+        made_by = simulator_digest(store, data, profile)
         for seed in profile.seeds:
-            folder = recording_folder(out, data, seed, simulator)
+            folder = recording_folder(out, data, seed, made_by)
             name = f"{SIMULATED}{seed}" + ("" if data == profile.data else f".{folder.name.split('-')[0]}")
             folders[name], own[name] = folder, (seed, data)
             if not folder.exists():
                 log(f"simulate: {data.robots} robots, {data.frames} frames each, seed {seed}")
                 folder.parent.mkdir(parents=True, exist_ok=True)
-                simulate(folder, **vars(data.settings(seed)))
+                _simulate(folder, data, seed, profile)
     for name, folder in recordings.items():
         folders[name] = folder.resolve()
     path = out / experiment.name / SUITE
@@ -210,6 +211,15 @@ def prepare(
     with new_file(path) as part:
         part.write_text(_suite_text(experiment, profile, folders, path.parent, own=own), encoding="utf-8")
     return read_suite(path)
+
+
+def _simulate(folder: Path, data: SimulatedData, seed: int, profile: Profile) -> None:
+    if data.steering:
+        from duagc.pipeline.experiments.steering import simulate_steered  # with the front end
+
+        simulate_steered(folder, data.settings(seed), data.steering, profile.set)
+    else:
+        simulate(folder, **vars(data.settings(seed)))
 
 
 def _suite_text(
@@ -306,13 +316,17 @@ def code_digest(store: Path) -> str:
     return _digest_of([SIMULATOR, *(stage.code for stage in used)], store)
 
 
-def simulator_digest(store: Path) -> str:
-    """Digest of the simulator, with all that it imports.
+def simulator_digest(store: Path, data: SimulatedData, profile: Profile) -> str:
+    """Digest of what makes recordings, with all that it imports; of a steered robot its settings as well.
 
     Args:
         store: of what was computed before, which remembers digests.
+        data: of the recordings.
+        profile: that they are of.
     """
-    return _digest_of([SIMULATOR], store)
+    if not data.steering:
+        return _digest_of([SIMULATOR], store)
+    return "\n".join([_digest_of([STEERING, SIMULATOR], store), *profile.set])
 
 
 def _digest_of(functions: Sequence[str], store: Path) -> str:

@@ -57,13 +57,15 @@ def _known() -> Iterator[str]:
     ]
     for views in (*of_maps, "own.training", "fused.training", "own_unrefined.held_out"):
         yield from (f"rendering.{views}.{key}" for key in _VIEWS.split())
+    for views in ("held_out", "peers"):
+        yield from (f"robots.alpha.rendering.own.{views}.{key}" for key in _VIEWS.split())
     for map_ in ("own", "refined"):
         for views in ("held_out", "peers"):
             yield from (f"pixel_calibration.{map_}.{views}.{key}" for key in _PIXELS.split())
 
 
 KNOWN = tuple(_known())
-"""Every name, as in `results.parquet`; `robots.*` is the mean over the robots."""
+"""Every name, as in `results.parquet`; `robots.*` is the mean over the robots, alpha the first one."""
 
 _OF_SURFACE = ("calibration.*", "consensus.matching_*")
 _OF_TRUTH = (*_OF_SURFACE, "*.ate_*", "*.rpe_*", "*_of_truth", "*.frames_with_truth", "*.depth_l1_exact_m")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from duagc.converters.simulate.trajectories.legs import FIRST_FRAMES, LEG_FRAMES
 from duagc.pipeline.cache import durations
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.frontend import TrackingConfig
@@ -22,9 +23,9 @@ FOUND_SHARE = 0.05
 """Of the predicted time, up to which an experiment was found, not computed."""
 
 
-RUN, FRONT_END = "run", "front end"
+RUN, FRONT_END, STEERING = "run", "front end", "steering"
 Part = tuple[str, ...]
-"""What is computed once: which of both, of which recording, with which settings."""
+"""What is computed once: which of these, of which recording, with which settings."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class PredictedTime:
     Attributes:
         runs: that their rules ask for.
         different: of them; the others are found in the store.
-        cpu_s: processor time of these, without simulating the recordings, which are few.
+        cpu_s: processor time of these, without simulating the recordings, which are few; with what steers a robot.
     """
 
     runs: int
@@ -98,7 +99,16 @@ def _parts(experiment: Experiment, profile: str) -> list[tuple[Part, float]]:
             recording = (data.model_dump_json(), str(seed))
             parts.append(((RUN, *recording, whole), rest_s))
             parts.append(((FRONT_END, *recording, images), front_s))
+            if data.steering not in ("", "random"):
+                parts.append(((STEERING, *recording), _steering_s(data, config)))
     return parts
+
+
+def _steering_s(data: SimulatedData, config: RunConfig) -> float:
+    """Of the maps by which a robot was steered."""
+    lengths = range(FIRST_FRAMES, data.frames, LEG_FRAMES)
+    alone = [data.model_copy(update={"robots": 1, "frames": frames}) for frames in lengths]
+    return sum(_times(one, config)[0] for one in alone)
 
 
 def _times(data: SimulatedData, config: RunConfig) -> tuple[float, float]:

@@ -44,6 +44,9 @@ class SimulatedData(Config):
     movers: int = 0
     masks: bool = True
     triangles: bool = False
+    steering: Literal["", "random", "information", "least", "unseen"] = ""
+    """What chooses each leg of the first robot: nothing, the largest or least gain in information, or most pixels
+    that show nothing of its map; empty: it walks as the others."""
 
     def settings(self, seed: int) -> SimulationSettings:
         """The same as the simulator has it.

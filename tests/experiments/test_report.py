@@ -65,11 +65,14 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("place")
     (root / "rules").mkdir()
     (root / "rules" / "mine.toml").write_text(FILE.replace("[0, 1, 2, 3, 4]", "[0, 1, 2, 3, 4, 5]"))
-    data = read_experiment("mine", root / "rules").profile("small").data
+    profile = read_experiment("mine", root / "rules").profile("small")
+    data = profile.data
     fake = fake_run.make(root / "fake")
     for seed in range(6):  # recordings that are there already
         with _small_code():
-            there = recording_folder(root / "out", data, seed, simulator_digest(root / "store"))
+            there = recording_folder(
+                root / "out", data, seed, simulator_digest(root / "store", data, profile)
+            )
         shutil.copytree(fake.recording, there)
     _carry_out(root, Measured("seed_5-lossy-5"))
     return root
@@ -127,12 +130,13 @@ def test_a_recording_that_is_missing_is_simulated_from_its_seed(place: Path, tmp
 
 
 def test_another_simulator_takes_no_recordings_of_the_one_before(place: Path, tmp_path: Path) -> None:
-    data = read_experiment("mine", place / "rules").profile("small").data
-    folders = []
+    profile = read_experiment("mine", place / "rules").profile("small")
+    data, folders = profile.data, []
     for simulator in ("DuagError", "closest", "DuagError"):
         with pytest.MonkeyPatch.context() as patch:
             _only_stage(patch, "closest", simulator)
-            folders.append(recording_folder(tmp_path, data, 0, simulator_digest(tmp_path / "store")))
+            digest = simulator_digest(tmp_path / "store", data, profile)
+            folders.append(recording_folder(tmp_path, data, 0, digest))
     assert folders[0] == folders[2] != folders[1]
 
 

@@ -164,6 +164,17 @@ def test_what_experiments_take_counts_equal_runs_once(folder: Path) -> None:
     assert predicted_each_s([mine, read_experiment("twin", folder)], "small") == [alone.cpu_s, 0.0]
 
 
+def test_steering_takes_the_time_of_its_maps(folder: Path) -> None:
+    def seconds(policy: str) -> float:
+        data = f'frames = 60, width = 32, height = 32, steering = "{policy}" }}'
+        (folder / "steered.toml").write_text(FILE.replace("frames = 2, width = 32, height = 32 }", data))
+        return predicted_time([read_experiment("steered", folder)], "small").cpu_s
+
+    assert seconds("") == seconds("random") < seconds("information") == seconds("unseen")
+    with pytest.raises(DuagError, match="steering"):
+        seconds("informed")
+
+
 def test_the_time_left_is_that_of_the_pace_so_far() -> None:
     predicted_s = [100.0, 200.0, 300.0]
     assert time_left_s(predicted_s, [], workers=2) == 300
