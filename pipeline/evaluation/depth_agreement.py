@@ -69,15 +69,16 @@ def pair_medians(
     pairs: list[tuple[int, int]] = []
     medians: dict[str, list[float]] = {name: [] for name in trajectories}
     for a, b in combinations(range(len(depths_m)), 2):
-        found = {
-            name: _difference_m(images[a], images[b], se3.inverse(T[a]) @ T[b], camera)
-            for name, T in trajectories.items()
-        }
-        if all(value is not None for value in found.values()):
+        found: dict[str, float] = {}
+        for name, T in trajectories.items():
+            difference_m = _difference_m(images[a], images[b], se3.inverse(T[a]) @ T[b], camera)
+            if difference_m is None:
+                break
+            found[name] = difference_m
+        else:
             pairs.append((a, b))
-            for name, value in found.items():
-                assert value is not None
-                medians[name].append(value)
+            for name, difference_m in found.items():
+                medians[name].append(difference_m)
     return PairMedians(pairs, {name: np.array(values) for name, values in medians.items()})
 
 
@@ -103,8 +104,10 @@ def _difference_m(
     inverse_a, points_a = a
     inverse_b, points_b = b
     there = _compare(inverse_a, se3.transform(T_a_b, points_b), camera)
+    if there is None:
+        return None
     back = _compare(inverse_b, se3.transform(se3.inverse(T_a_b), points_a), camera)
-    if there is None or back is None:
+    if back is None:
         return None
     return float(np.median(np.abs(np.concatenate([there, back]))))
 

@@ -68,20 +68,22 @@ def fit_exposure(drawn: Array, image: Array) -> tuple[float, float] | Absent:
     x, y = drawn[usable], image[usable]
     weight: NDArray[np.floating] = np.ones_like(x)
     gain, offset = 1.0, 0.0
-    for _ in range(ROUNDS):
+    for done in range(1, ROUNDS + 1):
         total = float(weight.sum())
         middle_x, middle_y = float(weight @ x) / total, float(weight @ y) / total
         dx, dy = x - middle_x, y - middle_y
         spread = PRIOR_SPREAD**2 * total
         gain = (float(weight @ (dx * dy)) + spread) / (float(weight @ (dx * dx)) + spread)
         offset = middle_y - gain * middle_x
+        if done == ROUNDS:
+            break
         residual = y - gain * x - offset
         weight = 1.0 / huber_divisor(residual, HUBER_SIGMAS * mad_sigma(residual) + 1e-6)
     return gain, offset
 
 
 def fitted_psnr(
-    render: Rendered, image: Array, valid: NDArray[np.bool_] | None = None
+    render: Rendered, image: Array, valid: NDArray[np.bool_] | None = None, *, seen: Image | None = None
 ) -> FittedPsnr | Absent:
     """PSNR of each half of a view in the exposure that was fitted on the other half.
 
@@ -91,6 +93,7 @@ def fitted_psnr(
         render: of the map, on black.
         image: colors [h, w, 3] in 0..1.
         valid: bool [h, w], pixels that are fitted and scored; None: all.
+        seen: `planes` of the image, where several renders are compared with it; None: made here.
 
     Returns:
         The scores, or why there are none.
@@ -100,8 +103,8 @@ def fitted_psnr(
     covered = counted & (render.alpha >= MIN_ALPHA)
     whole = bool(counted.all())
     halves = (slice(0, width // 2), slice(width // 2, width))
-    color, alpha = _planes(render.color), render.alpha
-    seen, errors = _planes(image), []
+    color, alpha, errors = planes(render.color), render.alpha, []
+    seen = planes(image) if seen is None else seen
     for scored, other in (halves, halves[::-1]):
         squares = _squared_errors((color, alpha, seen), scored, other, covered=covered)
         if isinstance(squares, Absent):
@@ -139,17 +142,20 @@ def _squared_errors(
     return squares
 
 
-def _planes(colors: NDArray[np.floating]) -> Image:
-    """Colors [h, w, 3] as [3, h, w]: arithmetic on every third number is slow."""
+def planes(colors: NDArray[np.floating]) -> Image:
+    """Colors [h, w, 3] as [3, h, w]: arithmetic on every third number is slow.
+
+    Args:
+        colors: of any floating type.
+    """
     return np.ascontiguousarray(colors.transpose(2, 0, 1), dtype=np.float32)
 
 
-def _thinned(used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The pixels of a half on a grid of about `MOST_PIXELS`."""
+def _thinned(used: NDArray[np.bool_]) -> tuple[NDArray[np.intp], ...]:
+    """Rows and columns of the pixels of a half on a grid of about `MOST_PIXELS`."""
     stride = max(1, int(np.sqrt(used.size / MOST_PIXELS)))
-    grid = np.zeros_like(used)
-    grid[stride // 2 :: stride, stride // 2 :: stride] = True
-    return used & grid
+    first = stride // 2
+    return tuple(first + stride * at for at in np.nonzero(used[first::stride, first::stride]))
 
 
 def _psnr(squares: Image) -> float:

@@ -22,10 +22,12 @@ def psnr(rendered: NDArray, reference: NDArray, mask: NDArray[np.bool_] | None =
         reference: colors [H, W, 3] in 0..1.
         mask: bool [H, W], pixels that count; None: all.
     """
-    error = np.clip(np.asarray(rendered, np.float64), 0.0, 1.0) - np.asarray(reference, np.float64)
-    if mask is not None:
+    clipped = np.clip(np.asarray(rendered), 0, 1)
+    error = np.subtract(clipped, reference, dtype=np.float64)
+    if mask is not None and not mask.all():
         error = error[mask]
-    mse = float(np.mean(error * error))
+    error *= error
+    mse = float(np.mean(error))
     return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))
 
 
@@ -60,13 +62,14 @@ _STRIP_ROWS = 32  # of windows at a time: what is computed of them stays in the 
 
 @dataclass(frozen=True)
 class _Scale:
-    """One scale of an image that renders are compared with: colors y, means and variances of its windows.
+    """One scale of an image that renders are compared with: colors y; means, their squares and variances of windows.
 
     `counted`: window positions that count; None: all.
     """
 
     y: Image
     mean: Image
+    mean2: Image
     variance: Image
     mask: masks.Mask | None
     counted: masks.Mask | None
@@ -78,35 +81,53 @@ class _Scale:
                 f"an image of {y.shape[1]}x{y.shape[0]} is smaller than the 11x11 window of SSIM"
             )
         mean = _window_mean(y)
-        variance = _window_mean(y * y) - mean * mean
-        return _Scale(y, mean, variance, mask, None if mask is None else counted_windows(mask))
+        mean2 = mean * mean
+        variance = _window_mean(y * y) - mean2
+        return _Scale(y, mean, mean2, variance, mask, None if mask is None else counted_windows(mask))
 
     def halved(self) -> _Scale:
         """The next scale."""
         return _Scale.of(halve(self.y), None if self.mask is None else masks.halved(self.mask))
 
-    def terms(self, x: Image) -> tuple[float, float]:
-        """Mean SSIM and mean contrast-structure term of a render [H, W, C] in 0..1."""
-        whole, structure = np.empty_like(self.mean), np.empty_like(self.mean)
+    def terms(self, x: Image, *, whole: bool = True) -> tuple[float, float]:
+        """Mean SSIM and contrast-structure term of a render [H, W, C] in 0..1; without `whole` the latter twice."""
+        images = [np.empty_like(self.mean) for _ in range(1 + whole)]
         for top in range(0, len(self.mean), _STRIP_ROWS):
             rows = slice(top, top + _STRIP_ROWS)
             seen = slice(top, top + _STRIP_ROWS + 2 * _WINDOW_RADIUS)
-            whole[rows], structure[rows] = self._strip(x[seen], self.y[seen], rows)
+            self._strip(x[seen], self.y[seen], rows, images)
         if self.counted is not None:
             if not self.counted.any():
                 raise ValueError("no 11x11 window of SSIM has usable pixels only")
             if not self.counted.all():
-                whole, structure = whole[self.counted], structure[self.counted]
-        return float(np.mean(whole, dtype=np.float64)), float(np.mean(structure, dtype=np.float64))
+                images = [image[self.counted] for image in images]
+        means = [float(np.mean(image, dtype=np.float64)) for image in images]
+        return means[-1], means[0]
 
-    def _strip(self, x: Image, y: Image, rows: slice) -> tuple[Image, Image]:
-        """SSIM and contrast-structure term of some rows of windows, from the pixels that they see."""
-        mx, my = _window_mean(x), self.mean[rows]
-        vx = _window_mean(x * x) - mx * mx
-        cov = _window_mean(x * y) - mx * my
-        structure = (2 * cov + _C2) / (vx + self.variance[rows] + _C2)
-        luminance = (2 * mx * my + _C1) / (mx * mx + my * my + _C1)
-        return np.asarray(luminance * structure), np.asarray(structure)
+    def _strip(self, x: Image, y: Image, rows: slice, images: Sequence[Image]) -> None:
+        """Contrast-structure term of some rows of windows, from the pixels that they see, and SSIM if it has an image.
+
+        (2 cov + C2) / (vx + vy + C2), and this times (2 mx my + C1) / (mx^2 + my^2 + C1).
+        """
+        mx = _window_mean(x)
+        mx2, mxy = mx * mx, mx * self.mean[rows]
+        below = _window_mean(x * x)
+        below -= mx2
+        below += self.variance[rows]
+        below += _C2
+        above = _window_mean(x * y)
+        above -= mxy
+        above *= 2
+        above += _C2
+        structure = np.divide(above, below, out=images[0][rows])
+        if len(images) == 1:
+            return
+        mxy *= 2
+        mxy += _C1
+        mx2 += self.mean2[rows]
+        mx2 += _C1
+        mxy /= mx2
+        np.multiply(mxy, structure, out=images[1][rows])
 
 
 class SsimReference:
@@ -155,11 +176,12 @@ class SsimReference:
                 f"MS-SSIM of {len(weights)} scales needs {smallest} pixels, found {x.shape[1]}x{x.shape[0]}"
             )
         first, product = 0.0, 1.0
+        last = len(weights) - 1
         for k, weight in enumerate(weights):
-            whole, structure = self._scale(k).terms(x)
+            whole, structure = self._scale(k).terms(x, whole=k in (0, last))
             first = first if k else whole
-            product *= max(whole if k == len(weights) - 1 else structure, 0.0) ** weight
-            x = halve(x) if k < len(weights) - 1 else x
+            product *= max(whole if k == last else structure, 0.0) ** weight
+            x = halve(x) if k < last else x
         return first, product
 
     def _clipped(self, rendered: NDArray) -> Image:

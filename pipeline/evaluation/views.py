@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.evaluation import image_metrics
-from duagc.pipeline.evaluation.exposure import fitted_psnr
+from duagc.pipeline.evaluation.exposure import fitted_psnr, planes
 from duagc.pipeline.evaluation.image_metrics import SsimReference
 from duagc.pipeline.evaluation.results import Absent, mean
 from duagc.pipeline.geometry import se3
@@ -56,6 +56,21 @@ class ViewScore:
     depth_completeness: Score
 
 
+class ComparedImage:
+    """An image that renders are compared with; what depends on it alone is computed once."""
+
+    def __init__(self, color: NDArray[np.uint8], mask: Mask | None = None) -> None:
+        """Set up.
+
+        Args:
+            color: [h, w, 3] RGB.
+            mask: bool [h, w], pixels that may be used; None: all.
+        """
+        self.color: NDArray[np.float64] = color.astype(np.float64) / 255.0
+        self.planes, self.mask = planes(self.color), mask
+        self.structure = SsimReference(self.color, mask)
+
+
 def surface_depth(render: Render) -> NDArray[np.float32]:
     """Depth [h, w] in meters of what was rendered: blended depth / alpha where alpha >= 0.5, else 0."""
     covered = render.alpha >= MIN_ALPHA
@@ -66,47 +81,43 @@ def surface_depth(render: Render) -> NDArray[np.float32]:
 
 def score_view(
     render: Render,
-    color: NDArray[np.uint8],
+    image: ComparedImage,
     depth_m: NDArray[np.float32],
     exact_m: Any,
     *,
     layer_m: Any = NO_LAYER,
     common: NDArray[np.bool_] | None = None,
-    mask: Mask | None = None,
     exposure: Exposure | None = None,
     moved: Render | None = None,
-    structure: SsimReference | None = None,
 ) -> ViewScore:
     """Compare a render with the image of the same pose, on the pixels that may be used.
 
     Args:
         render: of the map, at the pose of the frame, black background.
-        color: [h, w, 3] RGB.
+        image: of the frame, with its mask: the other pixels count in no score, and windows of SSIM that touch one are
+            left out.
         depth_m: recorded depth [h, w], 0 where there is none.
         exact_m: exact depth [h, w] in meters, or Absent.
         layer_m: depth of one layer per pixel (`Rasterizer.layer_depth`), [h, w] in meters, or Absent.
         common: [h, w], pixels that the maps that this one is compared with cover, too; None: there are none.
-        mask: bool [h, w], pixels that may be used: the others count in no score, and windows of SSIM that touch one
-            are left out; None: all.
         exposure: of the view, by frames other than it, for `psnr_interpolated_db` and `psnr_moved_db` alone. None: as
             the map.
         moved: the map as the camera saw it that moved while its shutter was open, for `psnr_moved_db` alone; None: it
             stood still.
-        structure: of the image in 0..1 and the mask, where several renders are compared with it; None: made here.
     """
+    mask = image.mask
     if mask is not None:
         depth_m = np.where(mask, depth_m, np.float32(0))
         exact_m = exact_m if isinstance(exact_m, Absent) else np.where(mask, exact_m, np.float32(0))
-    image = color.astype(np.float64) / 255.0
     l1_m, completeness = _depth(render, depth_m, "recorded")
-    ssim, ms_ssim = _structure(render, structure or SsimReference(image, mask), min(image.shape[:2]))
-    psnr_db = _psnr(render, image, mask)
-    fitted = _psnr_in_fitted_exposure(render, image, mask)
-    interpolated_db = psnr_db if exposure is None else _psnr(in_exposure(render, exposure), image, mask)
+    ssim, ms_ssim = _structure(render, image.structure, min(image.color.shape[:2]))
+    psnr_db = _psnr(render, image)
+    fitted = _psnr_in_fitted_exposure(render, image)
+    interpolated_db = psnr_db if exposure is None else _psnr(in_exposure(render, exposure), image)
     return ViewScore(
         psnr_db=psnr_db,
         psnr_interpolated_db=interpolated_db,
-        psnr_moved_db=interpolated_db if moved is None else _psnr(in_exposure(moved, exposure), image, mask),
+        psnr_moved_db=interpolated_db if moved is None else _psnr(in_exposure(moved, exposure), image),
         psnr_exposure_db=fitted[0],
         psnr_exposure_left_db=fitted[1],
         psnr_exposure_right_db=fitted[2],
@@ -132,17 +143,15 @@ def in_exposure(render: Render, exposure: Exposure | None) -> Render:
     return replace(render, color=exposure.in_image(render.color, render.alpha))
 
 
-def _psnr(render: Render, image: NDArray[np.float64], mask: Mask | None) -> Score:
-    if mask is not None and not mask.any():
+def _psnr(render: Render, image: ComparedImage) -> Score:
+    if image.mask is not None and not image.mask.any():
         return NO_PIXEL
-    return min(image_metrics.psnr(render.color, image, mask), PSNR_CEILING_DB)
+    return min(image_metrics.psnr(render.color, image.color, image.mask), PSNR_CEILING_DB)
 
 
-def _psnr_in_fitted_exposure(
-    render: Render, image: NDArray[np.float64], mask: Mask | None
-) -> tuple[Score, Score, Score]:
+def _psnr_in_fitted_exposure(render: Render, image: ComparedImage) -> tuple[Score, Score, Score]:
     """PSNR of the whole view, its left and its right half, each half in the exposure fitted on the other."""
-    found = fitted_psnr(render, image, mask)
+    found = fitted_psnr(render, image.color, image.mask, seen=image.planes)
     if isinstance(found, Absent):
         return found, found, found
     both, left, right = (min(value, PSNR_CEILING_DB) for value in (found.both, found.left, found.right))
@@ -248,7 +257,7 @@ def score_maps(
                     passed = T @ view.T_camera_moment
                     moved = draw_moving(own.rasterizer, gaussians, camera, passed, depth_kind=depth)
                 drawn[name] = render, layer_m, moved
-        structure = SsimReference(frame.color.astype(np.float64) / 255.0, frame.mask)
+        image = ComparedImage(frame.color, frame.mask)
         together = [drawn[name][0].alpha >= MIN_ALPHA for name in compared if name in drawn]
         common = np.logical_and.reduce(together) if len(together) > 1 else None
         scores: dict[str, ViewScore | Absent] = dict.fromkeys(
@@ -257,15 +266,13 @@ def score_maps(
         for name, (render, layer_m, moved) in drawn.items():
             scores[name] = score_view(
                 render,
-                frame.color,
+                image,
                 frame.depth,
                 view.exact_depth_m,
                 layer_m=layer_m,
                 common=common,
-                mask=frame.mask,
                 exposure=view.exposure,
                 moved=moved,
-                structure=structure,
             )
         return frame.index, scores
 

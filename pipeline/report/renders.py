@@ -18,7 +18,7 @@ from duagc.pipeline.evaluation.pixel_deviation import StatedMap, rendered_depth,
 from duagc.pipeline.evaluation.pixel_errors import stated_noise, true_depth
 from duagc.pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.evaluation.views import ScoredFrame, in_exposure, score_view, surface_depth
+from duagc.pipeline.evaluation.views import ComparedImage, ScoredFrame, in_exposure, score_view, surface_depth
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.geometry.exposure import Exposure
@@ -221,7 +221,7 @@ def _image_caption(frame: RgbdFrame) -> str:
 
 
 def _view_numbers(render: Render, frame: RgbdFrame) -> str:
-    score = score_view(render, frame.color, frame.depth, NO_EXACT, mask=frame.mask)
+    score = score_view(render, ComparedImage(frame.color, frame.mask), frame.depth, NO_EXACT)
     depth = labels.NONE if isinstance(score.depth_l1_m, Absent) else labels.meters_text(score.depth_l1_m)
     psnr = labels.NONE if isinstance(score.psnr_db, Absent) else f"{score.psnr_db:.1f} dB"
     return f"{psnr}, depth {depth}"

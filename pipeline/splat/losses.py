@@ -152,6 +152,14 @@ def depth_certainty(depth_sigma_m: Image, huber_m: float) -> Image:
 def halve(image: NDArray) -> NDArray:
     """Means of the 2x2 blocks of an image [H, W, ...]; a last odd row or column is cut."""
     h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    top, bottom = image[0:h:2, :w], image[1:h:2, :w]
-    quarter = image.dtype.type(0.25)
-    return quarter * (top[:, 0::2] + top[:, 1::2] + bottom[:, 0::2] + bottom[:, 1::2])
+    out = np.empty((h // 2, w // 2, *image.shape[2:]), image.dtype)
+    for channel in np.ndindex(
+        image.shape[2:]
+    ):  # one by one: numpy is slow where the innermost axis has three
+        top, bottom = image[0:h:2, :w, *channel], image[1:h:2, :w, *channel]
+        mean = top[:, 0::2] + top[:, 1::2]
+        mean += bottom[:, 0::2]
+        mean += bottom[:, 1::2]
+        mean *= image.dtype.type(0.25)
+        out[:, :, *channel] = mean
+    return out

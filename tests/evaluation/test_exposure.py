@@ -9,6 +9,7 @@ from duagc.pipeline.evaluation import views
 from duagc.pipeline.evaluation.exposure import FittedPsnr, fit_exposure, fitted_psnr
 from duagc.pipeline.evaluation.image_metrics import psnr
 from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.evaluation.views import ComparedImage
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.kernels import Render
 
@@ -104,7 +105,9 @@ def test_what_cannot_be_fitted_is_absent() -> None:
 def test_a_view_has_both_scores_under_their_own_names() -> None:
     color = np.rint(texture() * 255)
     image = np.rint(0.7 * color).astype(np.uint8)
-    score = views.score_view(drawn(color / 255), image, np.zeros(SHAPE, np.float32), Absent("none"))
+    score = views.score_view(
+        drawn(color / 255), ComparedImage(image), np.zeros(SHAPE, np.float32), Absent("none")
+    )
     assert score.psnr_db == pytest.approx(psnr(color / 255, image / 255.0), abs=1e-5)
     values = (score.psnr_exposure_db, score.psnr_exposure_left_db, score.psnr_exposure_right_db)
     assert all(isinstance(value, float) and value > 45 for value in values)
@@ -116,8 +119,8 @@ def test_an_interpolated_exposure_changes_only_the_score_of_its_name() -> None:
     image = np.rint(0.7 * color).astype(np.uint8)
     exposure = Exposure(np.full(3, 0.7), np.zeros(3), np.ones(3))
     depth, absent = np.zeros(SHAPE, np.float32), Absent("none")
-    plain = views.score_view(drawn(color / 255), image, depth, absent)
-    known = views.score_view(drawn(color / 255), image, depth, absent, exposure=exposure)
+    plain = views.score_view(drawn(color / 255), ComparedImage(image), depth, absent)
+    known = views.score_view(drawn(color / 255), ComparedImage(image), depth, absent, exposure=exposure)
     assert plain.psnr_interpolated_db == plain.psnr_db == known.psnr_db
     assert isinstance(known.psnr_interpolated_db, float)
     assert known.psnr_interpolated_db > 45
@@ -129,8 +132,10 @@ def test_a_view_as_its_camera_moved_changes_only_the_score_of_its_name() -> None
     image = np.rint(0.7 * color).astype(np.uint8)
     exposure = Exposure(np.full(3, 0.7), np.zeros(3), np.ones(3))
     wrong, depth, absent = drawn(np.zeros_like(color)), np.zeros(SHAPE, np.float32), Absent("none")
-    still = views.score_view(wrong, image, depth, absent, exposure=exposure)
-    moved = views.score_view(wrong, image, depth, absent, exposure=exposure, moved=drawn(color / 255))
+    still = views.score_view(wrong, ComparedImage(image), depth, absent, exposure=exposure)
+    moved = views.score_view(
+        wrong, ComparedImage(image), depth, absent, exposure=exposure, moved=drawn(color / 255)
+    )
     assert still.psnr_moved_db == still.psnr_interpolated_db
     assert isinstance(moved.psnr_moved_db, float)
     assert moved.psnr_moved_db > 45

@@ -15,6 +15,7 @@ from duagc.pipeline.evaluation.groundtruth import Surface, surface
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import top_view_axes
 from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.evaluation.views import ComparedImage
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Render
 from duagc.pipeline.recording import LogWriter, Recording, open_rgbd
@@ -34,7 +35,9 @@ def test_a_view_is_scored_against_image_and_both_depths():
     color = np.full((12, 14, 3), 102, dtype=np.uint8)  # 0.4 of white
     recorded = np.full((12, 14), 2.01, dtype=np.float32)
     recorded[0] = 0.0
-    score = views.score_view(a_render(alpha=0.8), color, recorded, np.full((12, 14), 1.95, dtype=np.float32))
+    score = views.score_view(
+        a_render(alpha=0.8), ComparedImage(color), recorded, np.full((12, 14), 1.95, dtype=np.float32)
+    )
     assert score.psnr_db == pytest.approx(20.0, abs=1e-4)
     assert score.depth_l1_m == pytest.approx(0.01, abs=1e-6)
     assert score.depth_l1_exact_m == pytest.approx(0.05, abs=1e-6)
@@ -45,7 +48,9 @@ def test_a_view_is_scored_against_image_and_both_depths():
 
 def test_an_equal_image_scores_a_finite_psnr():
     image = np.full((12, 14, 3), 255, dtype=np.uint8)
-    score = views.score_view(a_render(1.0), image, np.zeros((12, 14), dtype=np.float32), Absent("none"))
+    score = views.score_view(
+        a_render(1.0), ComparedImage(image), np.zeros((12, 14), dtype=np.float32), Absent("none")
+    )
     assert score.psnr_db == views.PSNR_CEILING_DB
     assert isinstance(score.depth_l1_m, Absent)
     assert isinstance(score.depth_completeness, Absent)
@@ -54,7 +59,7 @@ def test_an_equal_image_scores_a_finite_psnr():
 def test_depth_that_is_not_covered_is_incomplete_not_wrong():
     depth = np.full((12, 14), 2.0, dtype=np.float32)
     score = views.score_view(
-        a_render(alpha=0.3), np.zeros((12, 14, 3), dtype=np.uint8), depth, Absent("none")
+        a_render(alpha=0.3), ComparedImage(np.zeros((12, 14, 3), dtype=np.uint8)), depth, Absent("none")
     )
     assert isinstance(score.depth_l1_m, Absent)
     assert score.depth_completeness == 0.0
@@ -63,15 +68,16 @@ def test_depth_that_is_not_covered_is_incomplete_not_wrong():
 
 
 def test_the_depth_of_one_layer_is_a_figure_of_its_own():
-    color, recorded = np.zeros((12, 14, 3), dtype=np.uint8), np.full((12, 14), 2.0, dtype=np.float32)
+    image = ComparedImage(np.zeros((12, 14, 3), dtype=np.uint8))
+    recorded = np.full((12, 14), 2.0, dtype=np.float32)
     layer = np.full((12, 14), 2.03, dtype=np.float32)
     recorded[0], layer[1] = 0.0, 0.0
-    score = views.score_view(a_render(), color, recorded, Absent("none"), layer_m=layer)
+    score = views.score_view(a_render(), image, recorded, Absent("none"), layer_m=layer)
     assert score.depth_l1_layer_m == pytest.approx(0.03, abs=1e-6)
     assert score.depth_l1_m == pytest.approx(0.0, abs=1e-6)
-    without = views.score_view(a_render(), color, recorded, Absent("none"), layer_m=np.zeros_like(layer))
+    without = views.score_view(a_render(), image, recorded, Absent("none"), layer_m=np.zeros_like(layer))
     assert isinstance(without.depth_l1_layer_m, Absent)
-    assert views.score_view(a_render(), color, recorded, Absent("none")).depth_l1_layer_m == views.NO_LAYER
+    assert views.score_view(a_render(), image, recorded, Absent("none")).depth_l1_layer_m == views.NO_LAYER
 
 
 def test_what_moves_by_the_truth_counts_in_no_view(tmp_path, monkeypatch):
@@ -91,7 +97,7 @@ def test_what_moves_by_the_truth_counts_in_no_view(tmp_path, monkeypatch):
 def test_a_summary_counts_views_without_pose_apart():
     score = views.score_view(
         a_render(),
-        np.zeros((12, 14, 3), dtype=np.uint8),
+        ComparedImage(np.zeros((12, 14, 3), dtype=np.uint8)),
         np.full((12, 14), 2.0, dtype=np.float32),
         Absent("none"),
     )
