@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,7 +128,8 @@ class RobotTask:
         return RobotMeasures(scores, agreement, calibration, rows, pixels)
 
 
-def measured(
+@contextmanager
+def measuring(
     task: RobotTask,
     run: RunFolder,
     source: Recording,
@@ -136,8 +138,8 @@ def measured(
     workers: int,
     further: Mapping[str, Mapping[str, Gaussians]],
     hear: Hear,
-) -> dict[str, RobotMeasures]:
-    """Every robot, by name.
+) -> Iterator[Callable[[], dict[str, RobotMeasures]]]:
+    """What to call for the measures of every robot, by name; other processes are at work in the meantime.
 
     Args:
         task: measures one.
@@ -149,16 +151,17 @@ def measured(
         hear: gets every step, in another thread where there are other processes.
     """
     if min(workers, len(run.robots)) == 1:
-        return {
+        yield lambda: {
             name: task.of(name, run, source, truth=truth, further=further.get(name, {}), hear=hear)
             for name in run.robots
         }
+        return
     with (
         worker_reports.listening(hear) as queue,
         worker_pool(min(workers, len(run.robots)), worker_reports.keep_queue, (queue,)) as pool,
     ):
         begun = {name: pool.submit(task.in_worker, name, further.get(name, {})) for name in run.robots}
-        return {name: result.result() for name, result in begun.items()}
+        yield lambda: {name: result.result() for name, result in begun.items()}
 
 
 def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:

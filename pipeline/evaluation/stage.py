@@ -36,7 +36,7 @@ from duagc.pipeline.evaluation.results import (
     write_json,
     write_parquet,
 )
-from duagc.pipeline.evaluation.robot_measures import RobotMeasures, RobotTask, measured
+from duagc.pipeline.evaluation.robot_measures import RobotMeasures, RobotTask, measuring
 from duagc.pipeline.evaluation.trajectory_errors import Paired, TeamError
 from duagc.pipeline.evaluation.true_paths import TruePaths
 from duagc.pipeline.recording import Recording
@@ -129,7 +129,15 @@ def evaluate(
         for name in run.robots
     }
     task = RobotTask(Path(run_dir), Path(recording), threads, progress, most_views, saved)
-    of_robots = measured(task, run, source, truth, workers=workers, further=further, hear=hear)
+    with measuring(task, run, source, truth, workers=workers, further=further, hear=hear) as measures:
+        of_team = {
+            "team": _team_section(run, truth) | session.loop_closure_counts(),
+            "coverage": coverage.of_robots(run),
+            "components": coverage.of_components(run, truth.after),
+            "exchange": session.exchange_section(),
+            "consensus": session.consensus_section() | _matching_section(run, source, truth, session),
+        }
+        of_robots = measures()
     hear((OF_TEAM, "team", 0, 1))
     rendering = rendering_sections({name: m.scores for name, m in of_robots.items()}, longer=bool(longer))
     tree = {
@@ -140,14 +148,14 @@ def evaluate(
             | {"camera": cameras.section(robot), "rendering": rendering.robots[name]}
             for name, robot in run.robots.items()
         },
-        "team": _team_section(run, truth) | session.loop_closure_counts(),
-        "coverage": coverage.of_robots(run),
-        "components": coverage.of_components(run, truth.after),
+        "team": of_team["team"],
+        "coverage": of_team["coverage"],
+        "components": of_team["components"],
         "rendering": rendering.team,
         "calibration": _calibration_section(source, of_robots, rows),
         "pixel_calibration": _pixel_section(of_robots, rows),
-        "exchange": session.exchange_section(),
-        "consensus": session.consensus_section() | _matching_section(run, source, truth, session),
+        "exchange": of_team["exchange"],
+        "consensus": of_team["consensus"],
         "protocol": PROTOCOL | {"views": f"at most {most_views} of a set, evenly spread"},
     }
     metrics, reasons = split_reasons(tree)
