@@ -44,6 +44,9 @@ class PeerRegistrationConfig(RegistrationConfig):
     gray_noise_of_depth: bool = True
     """Count the error of a sample's depth in the noise of its gray value: robots meet at wide baselines, where gray
     values are trusted too much without."""
+    min_overlap: float = 0.2
+    """Smaller overlap is LOW_OVERLAP. Less than within a robot: features have agreed before, and a robot that stands
+    nearer sees little of what the samples of its neighbor show."""
 
 
 class VerificationConfig(GeometricVerificationConfig):
@@ -65,6 +68,8 @@ class VerificationConfig(GeometricVerificationConfig):
     """The same for its rotation."""
     samples: int = Field(default=2000, ge=50)
     """Points with normal and intensity of the neighbor's keyframe used by the registration."""
+    min_overlap: float = Field(default=0.2, ge=0.0, le=1.0)
+    """Overlap that the registration must find."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)
     """Largest translation by which the registration may change what RANSAC found."""
     registration: PeerRegistrationConfig = PeerRegistrationConfig()

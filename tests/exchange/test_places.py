@@ -14,6 +14,7 @@ from duagc.pipeline.config.exchange import (
     PlacesConfig,
     VerificationConfig,
 )
+from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.exchange import place_recognition
 from duagc.pipeline.exchange.detected_loop_closures import KeyframeDatabase
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
@@ -116,6 +117,23 @@ def test_a_darker_camera_finds_the_same_place(robots: dict) -> None:
     assert moved_rad < 0.002
     alike = VerificationConfig(registration=PeerRegistrationConfig(max_gain=2.0))  # as within one robot
     assert verified(Candidate(2, 0, 0), darker, sample, alike).verdict is Verdict.NOT_REGISTERED
+
+
+def test_a_view_that_shows_little_of_the_other_is_enough(robots: dict) -> None:
+    """Within a robot more is asked for: there is no lack of better pairs."""
+    (alpha, truth_a), (bravo, truth_b) = robots["alpha"], robots["bravo"]
+    sample, pair = loop_closing_wire.read_sample(loop_closing_wire.write_sample(bravo.sample(2)), 3), (1, 2)
+    result = verified(Candidate(*pair, 0), alpha, sample)
+    assert result.verdict is Verdict.KEPT
+    assert result.closure is not None
+    moved_m, moved_rad = se3.distance(result.closure.T_own_peer, se3.inverse(truth_a[1]) @ truth_b[2])
+    assert moved_m < 0.003
+    assert moved_rad < 0.002
+    within = RegistrationConfig().min_overlap
+    strict = VerificationConfig(registration=PeerRegistrationConfig(min_overlap=within), min_overlap=within)
+    refused = verified(Candidate(*pair, 0), alpha, sample, strict)
+    assert refused.verdict is Verdict.NOT_REGISTERED
+    assert "low_overlap" in refused.detail
 
 
 def test_different_places_are_refused(robots: dict, make_robot: Any) -> None:
