@@ -279,11 +279,11 @@ def carry_out(
         DuagError: what a user can fix; or the code was changed meanwhile.
     """
     chosen = experiment.profile(profile)
-    code = code_digest(store)
+    code = code_digest(store, experiment, chosen)
     suite = prepare(experiment, chosen, out, recordings=recordings, store=store, log=log)
     folder = out / experiment.name
     run_batch(suite, folder, store, engine, log=lambda line: log(f"{experiment.name}: {line}"))
-    if code_digest(store) != code:
+    if code_digest(store, experiment, chosen) != code:
         raise DuagError(
             f"{folder}: the code changed while its runs were computed, expected one; "
             "the same command computes those of other code again"
@@ -304,16 +304,20 @@ def carry_out(
     return [name for name in suite.cells if name not in done]
 
 
-def code_digest(store: Path) -> str:
+def code_digest(store: Path, experiment: Experiment, profile: Profile) -> str:
     """Digest of the simulator and the stages up to the evaluation, with all that they import and the built kernels.
 
     Every run of an experiment is of this code: those of other code are not taken from the store.
 
     Args:
         store: of what was computed before, which remembers digests.
+        experiment: whose code it is: what steers a robot counts where one is steered.
+        profile: how much is computed.
     """
     used = stages.STAGES[: 1 + stages.STAGES.index(stages.EVALUATION)]
-    return _digest_of([SIMULATOR, *(stage.code for stage in used)], store)
+    data = (data_of(experiment.file, profile, name) for name in experiment.file.configurations)
+    steering = [STEERING] if any(one.steering for one in data) else []
+    return _digest_of([SIMULATOR, *steering, *(stage.code for stage in used)], store)
 
 
 def simulator_digest(store: Path, data: SimulatedData, profile: Profile) -> str:

@@ -25,6 +25,9 @@ from duagc.pipeline.experiments.metric_names import check_metric
 
 RULES = Path(__file__).parent / "rules"
 Kind = Literal["better", "no_worse", "equivalent", "differs"]
+Policy = Literal["random", "information", "least", "unseen"]
+"""What chooses the legs of a steered robot: nothing; the largest, or the least gain in information; most pixels that
+show nothing of its map."""
 
 
 class SimulatedData(Config):
@@ -44,7 +47,7 @@ class SimulatedData(Config):
     movers: int = 0
     masks: bool = True
     triangles: bool = False
-    steering: Literal["", "random", "information", "least", "unseen"] = ""
+    steering: Policy | Literal[""] = ""
     """What chooses each leg of the first robot: nothing, the largest or least gain in information, or most pixels
     that show nothing of its map; empty: it walks as the others."""
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.experiments.rule import Policy
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.frontend.view_gain import ViewGain
 from duagc.pipeline.geometry import se3
@@ -30,8 +30,6 @@ from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RobotRun
 
-Policy = Literal["random", "information", "least", "unseen"]
-"""At random; of the largest gain in information; of the smallest; where most pixels show nothing of the map."""
 CANDIDATES = 12
 """Legs that a policy chooses among."""
 DRAWN = 0.5

@@ -143,10 +143,31 @@ def test_another_simulator_takes_no_recordings_of_the_one_before(place: Path, tm
 def test_code_that_changes_meanwhile_makes_no_result(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = (place / "out" / "mine" / RESULT).read_bytes()
     digests = iter(["one", "another"])
-    monkeypatch.setattr(carrying_out, "code_digest", lambda _: next(digests))
+    monkeypatch.setattr(carrying_out, "code_digest", lambda *_: next(digests))
     with pytest.raises(DuagError, match="the code changed while its runs were computed"):
         _carry_out(place, Measured("seed_5-lossy-5"))
     assert (place / "out" / "mine" / RESULT).read_bytes() == before
+
+
+def _code(place: Path, steering: str = "") -> str:
+    """Digest of the code of the experiment of a place, as if its first robot were steered."""
+    experiment = read_experiment("mine", place / "rules")
+    profile = experiment.profile("small")
+    data = profile.data.model_copy(update={"steering": steering})
+    return code_digest(place / "store", experiment, profile.model_copy(update={"data": data}))
+
+
+def test_what_steers_a_robot_is_code_of_its_experiment_alone(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _only_stage(monkeypatch, "closest")
+    found = []
+    for function in ("new_file", "read_text"):
+        monkeypatch.setattr(carrying_out, "STEERING", f"duagc.pipeline.base.files:{function}")
+        found.append((_code(place), _code(place, "random")))
+    (plain, steered), (plain_after, steered_after) = found
+    assert plain == plain_after
+    assert steered != steered_after
 
 
 def test_the_result_keeps_values_reasons_and_the_rule(place: Path) -> None:
@@ -178,11 +199,11 @@ def test_the_page_says_where_sections_are_of_different_code(
 ) -> None:
     result = json.loads((place / "out" / "mine" / RESULT).read_text())
     _only_stage(monkeypatch, "closest")
-    assert result["code_sha256"] == code_digest(place / "store")
+    assert result["code_sha256"] == _code(place)
     _only_stage(monkeypatch, "DuagError")
-    assert result["code_sha256"] != code_digest(place / "store")
+    assert result["code_sha256"] != _code(place)
     _only_stage(monkeypatch, "closest", simulator="closest")
-    assert result["code_sha256"] != code_digest(place / "store")
+    assert result["code_sha256"] != _code(place)
     other = {"same": result, "older": {k: v for k, v in result.items() if k != "code_sha256"}}
     pages = {}
     for name, twin in other.items():

@@ -10,8 +10,7 @@ from duagc.converters.simulate.settings import SimulationSettings
 from duagc.converters.simulate.trajectories.legs import FIRST_FRAMES, LEG_FRAMES
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.evaluation import groundtruth
-from duagc.pipeline.experiments import steering
-from duagc.pipeline.experiments.rule import SimulatedData
+from duagc.pipeline.experiments.rule import Policy, SimulatedData
 from duagc.pipeline.experiments.steering import simulate_steered, unseen, views_after
 from duagc.pipeline.frontend.view_gain import ViewGain
 from duagc.pipeline.geometry import se3
@@ -33,7 +32,7 @@ def small(policy: str) -> SimulatedData:
     return SimulatedData.model_validate(data)
 
 
-def steered(folder: Path, policy: steering.Policy) -> dict[str, np.ndarray]:
+def steered(folder: Path, policy: Policy) -> dict[str, np.ndarray]:
     """True paths of a small recording, by robot."""
     settings: SimulationSettings = small(policy).settings(7)
     simulate_steered(folder, settings, policy, SETTINGS)
