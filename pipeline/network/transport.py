@@ -168,13 +168,15 @@ class Transport:
         out: list[Outgoing] = []
         acknowledgements = self._acknowledgements(round_index)
         most_bytes, budget_bytes = budget_bytes, self._rate.budget(budget_bytes, round_index)
-        for message in [*acknowledgements, *states]:
-            budget_bytes -= self._overhead_bytes + len(message.payload)
-            if budget_bytes < 0:
-                return out
-            out.append(self._packet(message, 0, round_index))
         more = False
-        if self.in_contact(round_index):
+        for message in [*acknowledgements, *states]:
+            size = self._overhead_bytes + len(message.payload)
+            if size > budget_bytes:
+                more = True  # what is left counts in the next round, so that even the slowest link is never silent
+                break
+            budget_bytes -= size
+            out.append(self._packet(message, 0, round_index))
+        if not more and self.in_contact(round_index):
             for entry, chunk in self._due(round_index):
                 size = self._overhead_bytes + min(
                     chunk_bytes(entry.message.kind),

@@ -95,6 +95,16 @@ def test_a_link_that_becomes_fast_is_used_again() -> None:
     assert rate.limit is None
 
 
+def test_a_link_that_takes_less_than_a_state_a_round_is_not_silent() -> None:
+    """Between ends that have little to say, jitter looks like a link that carries as little."""
+    end = Transport(0, 1, "bravo", TransportConfig(), new_id=itertools.count(1).__next__)
+    end._rate.take(Congestion(2, 30, 0), 0)
+    sent = [len(end.burst(now, [Message(now, Kind.STATE, bytes(100))], BUDGET_BYTES)) for now in range(1, 61)]
+    assert set(sent) == {0, 1}
+    assert max(len(list(group)) for empty, group in itertools.groupby(sent) if not empty) <= 5
+    assert sent[-1] == 1
+
+
 def test_a_false_report_delays_a_little_and_once() -> None:
     rate = SendRate()
     assert rate.take(Congestion(60_000, 0, 7), 8) == MOST_ROUNDS
