@@ -1,4 +1,4 @@
-"""Features of a view with known depth, their matches between two views, and the motion that matches agree on.
+"""Features of a view with known depth, and their matches between two views.
 
 Descriptors are RootSIFT (Arandjelovic and Zisserman 2012), the square root of the L1-normalized SIFT, quantized to
 one byte. Products of bytes summed over 128 dimensions stay below 2^24, so float32 matrix products of them are exact
@@ -12,15 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.geometry import masks, se3, so3
+from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 Descriptors = NDArray[np.uint8]
 DIMENSIONS = 128
-REFINEMENT_ROUNDS = 3  # of fitting to the inliers and finding them again
 DARK, DARK_PERCENT = 100, 99  # gray value that one pixel in a hundred of a well exposed image exceeds
 SCALE = 512.0  # RootSIFT entries are at most 1 and mostly below 0.5; larger ones saturate at one byte
 
@@ -180,58 +178,3 @@ def _matches(squared: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
     second = squared.min(axis=0)
     good = mutual & (least < np.float32(ratio) ** 2 * second)
     return np.stack([best[good], columns[good]], axis=1)
-
-
-def fit(points_a: Array, points_b: Array) -> Array:
-    """T_a_b [..., 4, 4] that minimizes sum |a - T_a_b b|^2 over paired points (Kabsch, batched).
-
-    Args:
-        points_a: [..., n, 3].
-        points_b: [..., n, 3].
-    """
-    mean_a, mean_b = points_a.mean(axis=-2, keepdims=True), points_b.mean(axis=-2, keepdims=True)
-    R = so3.project(np.swapaxes(points_a - mean_a, -1, -2) @ (points_b - mean_b))
-    return se3.from_rotation_translation(R, mean_a[..., 0, :] - (R @ mean_b[..., 0, :, None])[..., 0])
-
-
-def ransac(
-    points_a: Array, points_b: Array, *, inlier_m: float, hypotheses: int, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.bool_]]:
-    """The motion that most matched points agree on.
-
-    Args:
-        points_a: [n, 3], n >= 3, camera frame a, meters.
-        points_b: [n, 3], the same points in camera frame b.
-        inlier_m: largest distance at one meter of depth; it grows with depth as the noise of a depth camera
-            does.
-        hypotheses: three-point samples drawn.
-        rng: draws them.
-
-    Returns:
-        T_a_b [4, 4], fitted to its inliers, and the inliers [n].
-    """
-    n = len(points_a)
-    # three different indices per row, without rejection: the second and third skip those before them
-    i = rng.integers(0, n, hypotheses)
-    j = rng.integers(0, n - 1, hypotheses)
-    k = rng.integers(0, n - 2, hypotheses)
-    j += j >= i
-    low, high = np.minimum(i, j), np.maximum(i, j)
-    k += k >= low
-    k += k >= high
-    triples = np.stack([i, j, k], axis=1)
-    limit_m = inlier_m * np.maximum(1.0, np.maximum(points_a[:, 2], points_b[:, 2]))
-
-    def agreeing(T: Array) -> NDArray[np.bool_]:
-        return np.linalg.norm(points_a - se3.transform(T, points_b), axis=-1) < limit_m
-
-    T = fit(points_a[triples], points_b[triples])
-    counts = agreeing(T).sum(axis=1)
-    best = T[int(np.argmax(counts))]
-    inliers = agreeing(best)
-    for _ in range(REFINEMENT_ROUNDS):
-        if inliers.sum() < 3:
-            break
-        best = fit(points_a[inliers], points_b[inliers])
-        inliers = agreeing(best)
-    return best, inliers

@@ -17,7 +17,8 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.registration.align import Registration, register
-from duagc.pipeline.registration.features import Features, matches, ransac
+from duagc.pipeline.registration.features import Features, matches
+from duagc.pipeline.registration.matched_points import ransac
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
 

@@ -49,20 +49,6 @@ def test_a_descriptor_matches_itself_only() -> None:
     assert np.array_equal(features.matches(a, theirs, 0.8), np.stack([np.arange(20)] * 2, axis=1))
 
 
-def test_ransac_finds_the_motion_among_false_matches() -> None:
-    rng = np.random.default_rng(2)
-    T = se3.exp([0.3, -0.2, 0.4, 0.5, -0.1, 0.2])
-    points_b = rng.uniform([-1, -1, 1], [1, 1, 3], (60, 3))
-    points_a = se3.transform(T, points_b) + rng.normal(0, 0.003, (60, 3))
-    points_a[:35] = rng.uniform([-1, -1, 1], [1, 1, 3], (35, 3))
-    found, inliers = features.ransac(
-        points_a, points_b, inlier_m=0.03, hypotheses=500, rng=random_streams.generator(0, "test")
-    )
-    assert inliers[35:].all()
-    assert inliers[:35].sum() <= 2
-    assert max(float(d) for d in se3.distance(found, T)) < 0.01
-
-
 def verified(candidate, database, sample, config=None) -> Verified:
     """What becomes of a candidate between a keyframe of a database and a neighbor's sample."""
     own = candidate.own_keyframe
