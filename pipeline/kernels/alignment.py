@@ -82,6 +82,7 @@ class Search:
         coarse_tolerance: the same at the others.
         prior_information: [6, 6] in the right tangent of the guess; None: no prior.
         projection: [6, 6], takes a tangent to its determined part; None: all of it is.
+        weights_by_correlation: at the finest level, divide the weights of either kind by its correlation.
     """
 
     iterations: Sequence[int]
@@ -90,6 +91,7 @@ class Search:
     coarse_tolerance: float
     prior_information: Doubles | None = None
     projection: Doubles | None = None
+    weights_by_correlation: bool = False
 
 
 LevelArrays = _raster.LevelArrays
@@ -198,7 +200,9 @@ def align(
     """
     T = np.array(T_reference_target_guess, dtype=np.float64).reshape(16)
     exposure, out = np.array([1.0, 0.0]), np.zeros(SYSTEM_SIZE)
-    limits = np.array([search.min_samples, search.tolerance, search.coarse_tolerance])
+    limits = np.array(
+        [search.min_samples, search.tolerance, search.coarse_tolerance, float(search.weights_by_correlation)]
+    )
     prior, projection = (_square(name, getattr(search, name)) for name in ("prior_information", "projection"))
     numbers = T, exposure, settings.array(), limits, prior, projection
     steps = _raster.align(isa, list(levels), list(search.iterations), *numbers, out)

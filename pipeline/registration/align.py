@@ -103,20 +103,17 @@ def register(
     """
     config = config or RegistrationConfig()
     guess = orthonormal(np.asarray(T_reference_target_guess, dtype=np.float64))
-    T, exposure, system = compiled.minimize(
-        reference, pyramid, guess, config, prior_information=prior_information, projection=ALL_DIRECTIONS
-    )
+
+    def minimum(projection: Array) -> tuple[Array, Array, System]:
+        return compiled.minimize(
+            reference, pyramid, guess, config, prior_information=prior_information, projection=projection
+        )
+
+    T, exposure, system = minimum(ALL_DIRECTIONS)
     found = _Determined.by(system, config)
     if len(found.weak) and system.seen.agreeing >= config.min_samples:
         # once more without the weak directions: what was found along them is noise
-        T, exposure, system = compiled.minimize(
-            reference,
-            pyramid,
-            guess,
-            config,
-            prior_information=prior_information,
-            projection=found.projection,
-        )
+        T, exposure, system = minimum(found.projection)
         found = _Determined.by(system, config).without(found)
     return _judge(
         system, found, T, guess, exposure=exposure, config=config, prior_information=prior_information
@@ -150,6 +147,8 @@ def linearize(
     T = orthonormal(np.asarray(T_reference_target, dtype=np.float64))
     start = np.array(exposure)
     system = compiled.linearize_at(reference, pyramid, level, T, exposure=start, config=config)
+    if config.weights_by_correlation and level == 0:
+        system = system.by_correlation()
     found = _Determined.by(system, config)
     step = search.step(system, T, T, None, projection=found.projection)
     T_minimum, exposure_minimum = T @ se3.exp(step[:6]), start + step[6:]

@@ -88,9 +88,11 @@ def minimize(
         coarse_tolerance=STEP_TOLERANCE_COARSE,
         prior_information=prior_information,
         projection=None if projection is ALL_DIRECTIONS else projection,
+        weights_by_correlation=config.weights_by_correlation,
     )
     T, exposure, numbers, _ = alignment.align(levels, guess, _settings(config), search, isa=isa)
-    return T, exposure, _system(numbers, len(reference.levels[0]))
+    system = _system(numbers, len(reference.levels[0]))
+    return T, exposure, system.by_correlation() if config.weights_by_correlation else system
 
 
 def _level_arrays(samples: ReferenceLevel, level: Level, config: RegistrationConfig) -> alignment.LevelArrays:

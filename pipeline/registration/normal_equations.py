@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
+
+POSE_PARAMETERS = 6  # of eight, the others are gain and offset
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,25 @@ class NormalEquations:
     count: int
     rms: float
     tile_gradients: Array
+
+    def correlation(self) -> float:
+        """The factor, at least 1, by which H exceeds the information because neighboring residuals share errors.
+
+        If they did not, the outer products of the gradients summed over tiles would have the expectation H; their
+        ratio to H is averaged over the directions that the residuals know of (cluster-robust covariance).
+        """
+        known = len(self.H) if self.H[-1, -1] > 0 else POSE_PARAMETERS
+        H, gradients = self.H[:known, :known], self.tile_gradients[:known]
+        return max(1.0, float(np.trace(np.linalg.solve(regular(H), gradients @ gradients.T))) / known)
+
+    def divided(self, factor: float) -> NormalEquations:
+        """The same with all weights divided by a factor."""
+        return replace(
+            self,
+            H=self.H / factor,
+            gradient=self.gradient / factor,
+            tile_gradients=self.tile_gradients / factor,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +89,11 @@ class System:
     def normal_equations(self) -> tuple[Array, Array]:
         """H [8, 8] and gradient [8] of both kinds together."""
         return self.depth.H + self.gray.H, self.depth.gradient + self.gray.gradient
+
+    def by_correlation(self) -> System:
+        """The same with the weights of either kind divided by its correlation."""
+        depth, gray = (part.divided(part.correlation()) for part in (self.depth, self.gray))
+        return replace(self, depth=depth, gray=gray)
 
 
 def regular(H: Array) -> Array:

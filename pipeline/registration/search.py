@@ -47,12 +47,15 @@ def minimize(
             system = linearize_at(reference, pyramid, index, T, exposure=exposure, config=config).system()
             if system.seen.agreeing < config.min_samples:
                 break
+            if index == 0 and config.weights_by_correlation:
+                system = system.by_correlation()
             change = step(system, T, guess, prior_information, projection=projection)
             T = orthonormal(T @ se3.exp(change[:6]))
             exposure = exposure + change[6:]
             if np.max(np.abs(change[:6])) < (STEP_TOLERANCE if index == 0 else STEP_TOLERANCE_COARSE):
                 break
-    return T, exposure, linearize_at(reference, pyramid, 0, T, exposure=exposure, config=config).system()
+    system = linearize_at(reference, pyramid, 0, T, exposure=exposure, config=config).system()
+    return T, exposure, system.by_correlation() if config.weights_by_correlation else system
 
 
 def levels_used(reference: Reference, pyramid: RgbdPyramid, config: RegistrationConfig) -> int:

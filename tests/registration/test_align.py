@@ -142,6 +142,31 @@ def test_errors_of_depth_count_as_noise_of_gray_values_across_a_wide_baseline():
     assert careful < 0.8 * mean_chi2_across_a_wide_baseline()
 
 
+def test_depth_that_is_wrong_over_whole_patches_counts_less():
+    """Depth that is off by as much over a part of the image, and gray values that are not: each as it deserves."""
+    errors = {
+        weighted: [error_with_patches_of_depth(seed, weights_by_correlation=weighted) for seed in range(8)]
+        for weighted in (False, True)
+    }
+    assert np.median(errors[True]) < 0.4 * np.median(errors[False])
+
+
+def error_with_patches_of_depth(seed: int, **settings: bool) -> float:
+    """Error of a translation, meters, where depth is off by 1 % of it over each of 20 parts of the image."""
+    views, noise = [], np.random.default_rng(seed)
+    for T in (START, END):
+        gray, depth = render(T)
+        edges = np.clip(0.5 + 6 * (gray - 0.5), 0, 1) + 0.005 * noise.standard_normal(gray.shape)
+        patches = np.kron(noise.standard_normal((4, 5)), np.ones((CAMERA.height // 4, CAMERA.width // 5)))
+        depth = depth * (1 + 0.01 * patches + 0.001 * noise.standard_normal(depth.shape))
+        views.append(RgbdPyramid.build(edges.astype(np.float32), depth.astype(np.float32), CAMERA))
+    result = register(
+        Reference.from_pyramid(views[0], STRIDES), views[1], np.eye(4), RegistrationConfig(**settings)
+    )
+    assert result.ok
+    return float(se3.distance(result.T_reference_target, T_START_END)[0])
+
+
 def test_between_views_from_one_place_depth_adds_no_noise_to_gray_values(reference):
     """The error moves a sample along its ray, which both cameras share."""
     turned = START @ se3.exp(np.array([0, 0, 0, 0.02, -0.03, 0.01]))

@@ -134,7 +134,8 @@ static Tiles make_tiles(const Samples& all, Flag flag) {
     return {static_cast<float>(TILE_COLUMNS / (static_cast<double>(u) + 1.0)), static_cast<float>(TILE_ROWS / (static_cast<double>(v) + 1.0))};
 }
 
-static void add_statistics(const Rows& rows, size_t begin, int count, const Samples& all, Tiles tiles, int parameters, NormalEquations& out) {
+template <int COUNT>
+static void add_statistics(const Rows& rows, size_t begin, int count, const Samples& all, Tiles tiles, NormalEquations& out) {
     for (int i = 0; i < count; i++) {
         if (rows.weight[i] == 0.0f) continue;  // its pixel may lie in none of the tiles
         const float weight = rows.weight[i], force = weight * rows.residual[i];
@@ -143,7 +144,8 @@ static void add_statistics(const Rows& rows, size_t begin, int count, const Samp
         out.squares += weight * (residual * residual);
         const int row = static_cast<int>(all[V][begin + i] * tiles.per_v), column = static_cast<int>(all[U][begin + i] * tiles.per_u);
         const int tile = row * TILE_COLUMNS + column;
-        for (int k = 0; k < parameters; k++) out.tile_gradients[k][tile] += static_cast<double>(rows.jacobian[k][i] * force);
+        double* const gradient = out.tile_gradients[tile];
+        for (int k = 0; k < COUNT; k++) gradient[k] += static_cast<double>(rows.jacobian[k][i] * force);
     }
 }
 
@@ -162,7 +164,7 @@ static void sum_batches(const Samples& all, Flag flag, const Tiles* tiles, Norma
             rows.residual[i] = rows.weight[i] = 0.0f;
         }
         add_products<COUNT>(rows, count, sums);
-        if (tiles) add_statistics(rows, begin, count, all, *tiles, COUNT, out);
+        if (tiles) add_statistics<COUNT>(rows, begin, count, all, *tiles, out);
     }
     write_sums(sums, COUNT, out);
 }

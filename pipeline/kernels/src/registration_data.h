@@ -43,7 +43,7 @@ struct NormalEquations {
     double scale;
     size_t count;
     double squares, weights;                            // sums of weight * residual^2 and weight
-    double tile_gradients[PARAMETERS][ALIGNMENT_TILES];
+    double tile_gradients[ALIGNMENT_TILES][PARAMETERS];
 };
 
 struct AlignmentSystem {
@@ -58,6 +58,7 @@ struct AlignmentSearch {
     int iterations[MOST_LEVELS];  // at most, by level
     size_t min_samples;
     double tolerance, coarse_tolerance;  // of steps, m and rad: smaller ones end a level
+    bool weights_by_correlation;         // at the finest level
     const double* prior;       // [6, 6], information of the right tangent of the guess, or null
     const double* projection;  // [6, 6], takes a tangent to its determined part, or null
 };

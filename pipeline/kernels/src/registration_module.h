@@ -36,7 +36,9 @@ static void write_normal_equations(const NormalEquations& part, bool statistics,
     out = std::copy(&part.H[0][0], &part.H[0][0] + PARAMETERS * PARAMETERS, out);
     out = std::copy(part.gradient, part.gradient + PARAMETERS, out);
     *out++ = part.scale, *out++ = static_cast<double>(part.count), *out++ = part.squares, *out++ = part.weights;
-    if (statistics) std::copy(&part.tile_gradients[0][0], &part.tile_gradients[0][0] + PARAMETERS * ALIGNMENT_TILES, out);
+    if (!statistics) return;
+    for (int k = 0; k < PARAMETERS; k++)
+        for (const auto& gradient : part.tile_gradients) *out++ = gradient[k];
 }
 constexpr size_t EQUATIONS = PARAMETERS * PARAMETERS + PARAMETERS + 4 + PARAMETERS * ALIGNMENT_TILES;
 
@@ -63,7 +65,7 @@ static void align_at(const std::string& isa, const LevelArrays& level, int index
     write_system(system, out.data());
 }
 
-// T and exposure are changed; search: minimal number of samples, tolerances. The number of steps.
+// T and exposure are changed; search: minimal number of samples, tolerances, whether weights are divided by correlation. The number of steps.
 static int align(const std::string& isa, const std::vector<const LevelArrays*>& levels, const std::vector<int>& iterations,
                  const Array<double>& T, const Array<double>& exposure, const Array<const double>& settings,
                  const Array<const double>& search, const Array<const double>& prior, const Array<const double>& projection,
@@ -81,6 +83,7 @@ static int align(const std::string& isa, const std::vector<const LevelArrays*>& 
     }
     of_search.min_samples = static_cast<size_t>(search.data()[0]);
     of_search.tolerance = search.data()[1], of_search.coarse_tolerance = search.data()[2];
+    of_search.weights_by_correlation = search.data()[3] != 0.0;
     of_search.prior = data_or_null(prior), of_search.projection = data_or_null(projection);
     const AlignmentSettings of_alignment = alignment_settings(settings);
     const nb::gil_scoped_release unlocked;

@@ -163,6 +163,33 @@ static void restrict_to(const double* projection, double H[PARAMETERS][PARAMETER
     std::memcpy(g, Pg, sizeof Pg);
 }
 
+// The factor, at least 1, by which the normal matrix exceeds the information because neighboring residuals share errors: by the outer
+// products of the gradients summed over tiles (registration.normal_equations).
+static double correlation(const NormalEquations& part) {
+    const int n = part.H[PARAMETERS - 1][PARAMETERS - 1] > 0.0 ? PARAMETERS : POSE_PARAMETERS;
+    double trace = 0.0;
+    for (int k = 0; k < n; k++) trace += part.H[k][k];
+    double total = 0.0;
+    for (int column = 0; column < n; column++) {
+        double A[PARAMETERS][PARAMETERS] = {}, b[PARAMETERS] = {};
+        for (int i = 0; i < PARAMETERS; i++)
+            for (int j = 0; j < PARAMETERS; j++)
+                A[i][j] = i < n && j < n ? part.H[i][j] + (i == j ? 1e-10 * trace / n + 1e-300 : 0.0) : i == j ? 1.0 : 0.0;
+        for (int i = 0; i < n; i++)
+            for (int tile = 0; tile < ALIGNMENT_TILES; tile++) b[i] += part.tile_gradients[tile][i] * part.tile_gradients[tile][column];
+        solve(A, b);
+        total += b[column];
+    }
+    return total > n ? total / n : 1.0;
+}
+
+static void divide(NormalEquations& part, double factor) {
+    for (int i = 0; i < PARAMETERS; i++) {
+        part.gradient[i] /= factor;
+        for (int j = 0; j < PARAMETERS; j++) part.H[i][j] /= factor;
+    }
+}
+
 // A Gauss-Newton step, slightly damped and limited in length; the largest component of its pose.
 static double gauss_newton_step(const AlignmentSystem& system, const Motion& T, const Motion& guess, const AlignmentSearch& search, double* step) {
     double H[PARAMETERS][PARAMETERS], g[PARAMETERS];
@@ -235,9 +262,12 @@ static void align(const SampleArrays* samples, const TargetImages* images, const
     state.steps = 0;
     for (int level = search.levels - 1; level >= 0; level--)
         for (int k = 0; k < search.iterations[level]; k++) {
-            align_at(samples[level], images[level], level, state.T, state.exposure, settings, false, scratch, system);
+            const bool weighted = search.weights_by_correlation && level == 0;
+            align_at(samples[level], images[level], level, state.T, state.exposure, settings, weighted, scratch, system);
             state.steps++;
             if (system.agreeing < search.min_samples) break;
+            if (weighted)
+                for (NormalEquations* part : {&system.depth, &system.gray}) divide(*part, correlation(*part));
             double step[PARAMETERS];
             const double largest = gauss_newton_step(system, T, guess, search, step);
             T = product(T, exponential(step));
