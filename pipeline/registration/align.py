@@ -3,7 +3,8 @@
 The residuals (`residuals.py`) are minimized together over the right tangent (translation, rotation) of
 T_reference_target and an affine brightness (gain, offset), from the coarsest pyramid level to the finest.
 Point-to-plane alone slides along walls, gray values alone know no scale; together they hold all six directions
-(Steinbruecker et al. 2011; Kerl et al. 2013; Park et al. 2017).
+(Steinbruecker et al. 2011; Kerl et al. 2013; Park et al. 2017). At the finest level either kind counts by its own
+information, its correlated errors included (`System.by_correlation`).
 
 Directions that the images do not determine (a bare wall) stay where the guess or its prior has them and carry zero
 information (solution remapping: Zhang, Kaess and Singh 2016).
@@ -52,7 +53,8 @@ class Registration:
         rms_gray: weighted gray residual.
         exposure: (gain, offset) with target gray = gain * reference gray + offset.
         samples: how many agree.
-        overconfidence: factor >= 1 by which the normal matrix was divided to give the information.
+        overconfidence: factor >= 1 by which the normal matrix, of weights by correlation, was divided to give the
+            information.
         condition: ratio of the largest to the smallest eigenvalue of the information before weak directions were
             removed, rotations scaled by the median depth.
         weak: [m, 6], directions in the right tangent that the images do not determine; the information is zero along
