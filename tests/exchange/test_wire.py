@@ -24,6 +24,12 @@ RNG = np.random.default_rng(5)
 TEAM = 4
 
 
+@pytest.fixture(autouse=True)
+def _same_draws() -> None:
+    """What a test draws does not depend on the tests that the same process ran before."""
+    RNG.bit_generator.state = np.random.default_rng(5).bit_generator.state
+
+
 def poses(n: int) -> np.ndarray:
     return se3.exp(RNG.normal(size=(n, 6)))
 
