@@ -17,13 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.network import TransportConfig
-from duagc.pipeline.network.congestion import (
-    FULL_ROUNDS,
-    MOST_ROUNDS,
-    Congestion,
-    LinkObserver,
-    SendRate,
-)
+from duagc.pipeline.network.congestion import FULL_ROUNDS, MOST_ROUNDS, Congestion, LinkObserver, SendRate
 from duagc.pipeline.network.messages import Arrival, Message, Outgoing
 from duagc.pipeline.network.packets import (
     EVIDENCE_KINDS,
@@ -40,9 +34,7 @@ from duagc.pipeline.network.packets import (
 from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
 
 _ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks; then one bit per chunk
-_FULL_LINK = struct.Struct(
-    "<IIHI"
-)  # no message, bytes a round that the link takes, late rounds, round of sending
+_FULL_LINK = struct.Struct("<IIHI")  # no message, bytes a round that it takes, late rounds, round of sending
 _FULL_LINK_ID = 2**32 - 1
 MAX_REPEATS = 32
 LAST_CHUNKS = 3
@@ -58,6 +50,11 @@ class _Open:
     message: Message
     acknowledged: NDArray[np.bool_]
     due_round: NDArray[np.int64]
+
+    def size(self, chunk: int) -> int:
+        """Bytes of a chunk, headers left out."""
+        whole = chunk_bytes(self.message.kind)
+        return min(whole, len(self.message.payload) - chunk * whole)
 
 
 @dataclass
@@ -178,10 +175,7 @@ class Transport:
             out.append(self._packet(message, 0, round_index))
         if not more and self.in_contact(round_index):
             for entry, chunk in self._due(round_index):
-                size = self._overhead_bytes + min(
-                    chunk_bytes(entry.message.kind),
-                    len(entry.message.payload) - chunk * chunk_bytes(entry.message.kind),
-                )
+                size = self._overhead_bytes + entry.size(chunk)
                 if size > budget_bytes:
                     more = True
                     break

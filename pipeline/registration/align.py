@@ -21,7 +21,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import compiled, search
-from duagc.pipeline.registration.normal_equations import System, regular
+from duagc.pipeline.registration.normal_equations import System, excess, regular
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
 from duagc.pipeline.registration.search import ALL_DIRECTIONS, orthonormal
@@ -287,5 +287,4 @@ def _overconfidence(system: System, H: Array) -> float:
         gradient = part.gradient[:6]
         answer = np.linalg.solve(regular(part.H[:6, :6] + 1e-3 * H[:6, :6]), gradient)
         depth_color_chi2 += float(gradient @ answer)
-    correlation = float(np.trace(np.linalg.solve(regular(H), outer))) / 8
-    return max(1.0, correlation, depth_color_chi2 / 6)
+    return max(1.0, excess(H, outer), depth_color_chi2 / 6)

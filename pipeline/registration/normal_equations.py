@@ -39,7 +39,7 @@ class NormalEquations:
         """
         known = len(self.H) if self.H[-1, -1] > 0 else POSE_PARAMETERS
         H, gradients = self.H[:known, :known], self.tile_gradients[:known]
-        return max(1.0, float(np.trace(np.linalg.solve(regular(H), gradients @ gradients.T))) / known)
+        return max(1.0, excess(H, gradients @ gradients.T))
 
     def divided(self, factor: float) -> NormalEquations:
         """The same with all weights divided by a factor."""
@@ -94,6 +94,16 @@ class System:
         """The same with the weights of either kind divided by its correlation."""
         depth, gray = (part.divided(part.correlation()) for part in (self.depth, self.gray))
         return replace(self, depth=depth, gray=gray)
+
+
+def excess(H: Array, outer: Array) -> float:
+    """How far gradients of tiles spread beyond what independent residuals would, averaged over the directions.
+
+    Args:
+        H: [n, n], normal matrix.
+        outer: [n, n], sum of the outer products of the gradients of the tiles.
+    """
+    return float(np.trace(np.linalg.solve(regular(H), outer))) / len(H)
 
 
 def regular(H: Array) -> Array:
