@@ -119,6 +119,12 @@ class Cell:
         """Of its files and rows."""
         return CLEAN if self.dial == CLEAN else f"{self.dial}-{self.level:g}"
 
+    def value(self) -> str:
+        """Of its dial, with its unit."""
+        if self.dial in DIALS:
+            return DIALS[self.dial].text(self.level)
+        return "" if self.dial == CLEAN else f"{self.level:g} x middle"
+
     def settings(self) -> tuple[Rig, Degradations]:
         """Of the simulator."""
         turned = DIALS.values() if self.dial == ALL else [d for d in DIALS.values() if d.name == self.dial]
@@ -228,9 +234,27 @@ def measure(
     Returns:
         The row: plain numbers, None for what there is not; "failed" if the run could not be carried out.
     """
+    simulate_cell(cell, plan, folder / "recording", workers=workers)
+    row: dict[str, Any] = {"dial": cell.dial, "level": cell.level, "value": cell.value()}
+    try:
+        execute(folder / "recording", folder / "run")
+    except DuagError as error:
+        return row | {"failed": str(error).replace(str(folder), cell.name)}
+    return row | measured(RunFolder(folder / "run"), Recording(folder / "recording"))
+
+
+def simulate_cell(cell: Cell, plan: RobustnessPlan, out: Path, *, workers: int = 1) -> None:
+    """Write the recording of a cell.
+
+    Args:
+        cell: the cell.
+        plan: with scene and walk.
+        out: folder of the recording; there is none yet.
+        workers: processes that render; changes no result.
+    """
     rig, degradations = cell.settings()
     simulate(
-        folder / "recording",
+        out,
         robots=plan.robots,
         frames=plan.frames,
         scene=plan.scene,
@@ -242,12 +266,6 @@ def measure(
         triangles=True,
         workers=workers,
     )
-    row: dict[str, Any] = {"dial": cell.dial, "level": cell.level, "value": _value(cell)}
-    try:
-        execute(folder / "recording", folder / "run")
-    except DuagError as error:
-        return row | {"failed": str(error).replace(str(folder), cell.name)}
-    return row | measured(RunFolder(folder / "run"), Recording(folder / "recording"))
 
 
 def measured(run_folder: RunFolder, recording: Recording) -> dict[str, Any]:
@@ -332,12 +350,6 @@ def _within(value: float | None, most: float) -> bool:
     return value is not None and value <= most
 
 
-def _value(cell: Cell) -> str:
-    if cell.dial in DIALS:
-        return DIALS[cell.dial].text(cell.level)
-    return "" if cell.dial == CLEAN else f"{cell.level:g} x middle"
-
-
 def _plain(plan: RobustnessPlan) -> dict[str, Any]:
     """What a cell depends on: all but which other cells there are."""
     plain = asdict(plan) | {"size": list(plan.size)}
@@ -350,15 +362,29 @@ def _file(out: Path, cell: Cell) -> Path:
 
 
 def _kept(out: Path, cell: Cell, want: dict[str, Any]) -> dict[str, Any] | None:
-    path = _file(out, cell)
-    if not path.is_file():
-        return None
-    try:
-        kept = json.loads(path.read_text())
-    except ValueError:
-        return None
+    kept = _read(out, cell)
     row: dict[str, Any] | None = kept.pop("row", None)
     return row if kept == want else None
+
+
+def finished_row(out: Path, cell: Cell, plan: RobustnessPlan) -> dict[str, Any] | None:
+    """The row of a cell that was finished on the same walk, whatever code and settings made it; None: there is none.
+
+    Args:
+        out: folder of the results.
+        cell: the cell.
+        plan: with scene and walk.
+    """
+    kept = _read(out, cell)
+    return kept.get("row") if kept.get("plan") == _plain(plan) else None
+
+
+def _read(out: Path, cell: Cell) -> dict[str, Any]:
+    """The file of a finished cell; empty if there is none, or it is damaged."""
+    try:
+        return dict(json.loads(_file(out, cell).read_text()))
+    except (OSError, ValueError):
+        return {}
 
 
 def _code_digest() -> str:

@@ -28,6 +28,13 @@ def bench_robustness(
     noise: Annotated[str, typer.Option(help="none or kinect, in the clean cell as well.")] = "kinect",
     seed: Annotated[int, typer.Option(help="Seed of scene, walks and noise.")] = 0,
     keep: Annotated[bool, typer.Option("--keep", help="Keep recordings and runs, in --out/runs.")] = False,
+    true_images: Annotated[
+        bool,
+        typer.Option(
+            "--true-images",
+            help="Run nothing: what plain PSNR the true images have against those of each dial.",
+        ),
+    ] = False,
     list_dials: Annotated[
         bool, typer.Option("--list", help="List the dials, their middle values and where these come from.")
     ] = False,
@@ -45,11 +52,13 @@ def bench_robustness(
 
     Examples: `duagc bench robustness --out outputs/robustness`,
     `duagc bench robustness --only blur,lens --levels 0.5,1,1.5 --out outputs/robustness`,
-    `duagc bench robustness --only missing --keep --out outputs/robustness`
+    `duagc bench robustness --only missing --keep --out outputs/robustness`,
+    `duagc bench robustness --true-images --out outputs/robustness`
     """
     from duagc.pipeline.base import determinism
     from duagc.pipeline.base.files import new_file
     from duagc.pipeline.bench import robustness, robustness_tables
+    from duagc.pipeline.bench import true_images as reference
     from duagc.pipeline.config.base import dump_config, load_config
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.evaluation.results import write_json
@@ -60,7 +69,7 @@ def bench_robustness(
         for dial in robustness.DIALS.values():
             print(f"{dial.name:<16}{dial.text(1):>8}  {dial.source}")
         return
-    known = (*robustness.DIALS, robustness.ALL)
+    known = reference.DIALS_OF_FRAMES if true_images else (*robustness.DIALS, robustness.ALL)
     dials = known if only is None else tuple(only.split(","))
     for name in dials:
         if name not in known:
@@ -79,6 +88,11 @@ def bench_robustness(
         noise=noise,
         seed=seed,
     )
+
+    if true_images:
+        rows = reference.run(plan, out, workers=workers)
+        print(reference.as_json(rows) if as_json else reference.format_table(rows))
+        return
 
     def write(rows: list[dict[str, Any]]) -> None:
         write_json(out / "robustness.json", {"rows": rows})
