@@ -18,7 +18,7 @@ from duagc.pipeline.base.machine import processors
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.bench.tables import markdown
 from duagc.pipeline.bench.whole_runs import THIS, execute, part_of, seconds_of
-from duagc.pipeline.recording import RECORDING_FILE, Recording
+from duagc.pipeline.recording import RECORDING_FILE, Recording, content_digest
 
 SCHEMA = 1
 
@@ -123,7 +123,8 @@ def _row(plan: LengthPlan, source: Recording, seconds: float, folder: Path) -> d
 def _part(source: Recording, seconds: float, path: Path) -> Recording:
     """The recording that its logs begin with; taken from where it stays, if it is of this recording."""
     stays = path.with_name(f"{path.name}.of.json")
-    of = {name: row.get("digests") for name, row in source.description["robots"].items()}
+    rows = source.description["robots"]
+    of = {name: row.get("digests") or content_digest(source.log(name)) for name, row in rows.items()}
     if (path / RECORDING_FILE).is_file():
         if not stays.is_file() or json.loads(stays.read_text(encoding="utf-8")) != of:
             raise DuagError(

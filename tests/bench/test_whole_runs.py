@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import stat
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -127,14 +129,23 @@ def test_what_is_kept_is_completed(
     assert sorted(path.name for path in (tmp_path / "kept").glob("run*")) == ["run0.1", "run0.2"]
 
 
+@pytest.mark.parametrize("stated", [True, False], ids=["digests", "no digests"])
 def test_what_is_kept_of_another_recording_is_refused(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: bool
 ) -> None:
     monkeypatch.setattr(length, "THIS", (str(command(tmp_path, 3.0)),))
-    other = whole_runs.part_of(recording, 2, 0.2, tmp_path / "other")
-    length.run(length.LengthPlan(other.path, (0.1, 0.1), threads=1, keep=tmp_path / "kept"))
+    shorter, longer = (whole_runs.part_of(recording, 2, s, tmp_path / f"{s}s").path for s in (0.2, 0.3))
+    if not stated:
+        for path in (shorter, longer):
+            description = json.loads((path / "recording.json").read_text())
+            for row in description["robots"].values():
+                del row["digests"]
+            (path / "recording.json").write_text(json.dumps(description))
+    plan = length.LengthPlan(shorter, (0.1, 0.1), threads=1, keep=tmp_path / "kept")
+    length.run(plan)
+    assert length.run(plan)["rows"][0]["wall_s"] is None
     with pytest.raises(DuagError, match=r"recording0\.1: is not known to be of .*choose another --keep"):
-        length.run(length.LengthPlan(recording.path, (0.1,), threads=1, keep=tmp_path / "kept"))
+        length.run(replace(plan, recording=longer))
 
 
 @pytest.mark.parametrize(
