@@ -65,7 +65,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
     ),
     (
         _part("registration", "dense RGB-D alignment, features", _ARRAYS, "kernels", estimator=True),
-        _part("recording", "logs and recordings", _ARRAYS, "schemas messages"),
+        _part("recording", "logs and recordings", _ARRAYS, "schemas messages kernels"),
     ),
     (
         _part(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ COLOR_READOUT_KEY, DEPTH_READOUT_KEY = "rolling_shutter_s", "depth_rolling_shutt
 LONGEST_S = 0.2
 LEAST_MOVE_PX = 0.25  # of a pixel between the middle row and its own: less is not worth to interpolate for
 STEP_PX = 16  # between the pixels whose motion is computed; that of the others is interpolated
+SAMPLE_PX = 4  # between the depths that a mean over a neighborhood is taken of
 ROUNDS = 3  # of looking up the row of a pixel; each brings it nearer by as much as the motion changes by row
 
 
@@ -93,8 +95,7 @@ class Unrolling:
             depth_m: depth [h, w] of about that time, 0 = unknown: parallax is that of its means over a neighborhood.
         """
         self._camera, self._T_row_middle = camera, se3.inverse(T_middle_row)
-        rows = np.unique(np.r_[np.arange(0, camera.height, STEP_PX), camera.height - 1])
-        columns = np.unique(np.r_[np.arange(0, camera.width, STEP_PX), camera.width - 1])
+        rows, columns = _steps(camera.height), _steps(camera.width)
         u, v = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         points = rays / _mean_inverse(depth_m, rows, columns)[..., None]
@@ -106,28 +107,12 @@ class Unrolling:
             found_v = camera.fy * there[..., 1] / there[..., 2] + camera.cy
         moved = np.stack([found_u - u, found_v - v], axis=-1)
         self.move_px = float(np.median(np.hypot(moved[..., 0], moved[..., 1])))
-        self._u, self._v = self._between(moved.astype(np.float32), rows, columns)
+        self._u, self._v = _interpolated(moved.astype(np.float32), camera.height, camera.width)
 
     @property
     def is_needed(self) -> bool:
         """Whether pixels move by more than interpolation costs."""
         return self.move_px >= LEAST_MOVE_PX
-
-    def _between(
-        self, moved: Image, rows: NDArray[np.int64], columns: NDArray[np.int64]
-    ) -> tuple[Image, Image]:
-        """Columns and rows [h, w] of all pixels in the rolling image."""
-        import cv2
-
-        camera = self._camera
-        at_u = np.interp(np.arange(camera.width), columns, np.arange(len(columns))).astype(np.float32)
-        at_v = np.interp(np.arange(camera.height), rows, np.arange(len(rows))).astype(np.float32)
-        at = np.meshgrid(at_u, at_v)
-        whole = cv2.remap(moved, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        u, v = np.meshgrid(
-            np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32)
-        )
-        return u + whole[..., 0], v + whole[..., 1]
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Colors [h, w, 3], interpolated; beyond the border those at the border.
@@ -178,14 +163,45 @@ class Unrolling:
         return DepthImage(found, sigma)
 
 
+def _steps(size: int) -> NDArray[np.int64]:
+    """Rows or columns whose motion is computed."""
+    return np.unique(np.r_[np.arange(0, size, STEP_PX), size - 1])
+
+
+@lru_cache(maxsize=4)
+def _grids(height: int, width: int) -> tuple[tuple[Image, Image], tuple[Image, Image]]:
+    """Columns and rows [h, w] of all pixels, and where these are among those whose motion is computed."""
+    sizes = width, height
+    at = [np.interp(np.arange(n), _steps(n), np.arange(len(_steps(n)))) for n in sizes]
+    pixels, steps = (
+        np.meshgrid(*(values.astype(np.float32) for values in two))
+        for two in ([np.arange(n) for n in sizes], at)
+    )
+    return (pixels[0], pixels[1]), (steps[0], steps[1])
+
+
+def _interpolated(moved: Image, height: int, width: int) -> tuple[Image, Image]:
+    """Columns and rows [h, w] in the rolling image of all pixels, by the motion [k, l, 2] of some."""
+    import cv2
+
+    pixels, steps = _grids(height, width)
+    found = [
+        whole + cv2.remap(part, *steps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for whole, part in zip(pixels, cv2.split(moved), strict=True)
+    ]
+    return found[0], found[1]
+
+
 def _mean_inverse(depth_m: Image, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Array:
     """Mean inverse depth around some pixels; where there is none that of the image, and of 1 m without any."""
     import cv2
 
-    side = (2 * STEP_PX + 1, 2 * STEP_PX + 1)
-    known = depth_m > 0
-    inverse = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float32)
+    sampled = depth_m[::SAMPLE_PX, ::SAMPLE_PX]
+    side = (2 * STEP_PX // SAMPLE_PX + 1,) * 2
+    known = sampled > 0
+    inverse = np.where(known, 1 / np.where(known, sampled, 1), 0).astype(np.float32)
     share = cv2.blur(known.astype(np.float32), side)
     mean = cv2.blur(inverse, side) / np.maximum(share, 1e-6)
     middle = float(np.median(inverse[known])) if known.any() else 1.0
-    return np.where(share > 0.05, mean, middle)[np.ix_(rows, columns)].astype(np.float64)
+    around = np.ix_(rows // SAMPLE_PX, columns // SAMPLE_PX)
+    return np.where(share > 0.05, mean, middle)[around].astype(np.float64)

@@ -1,10 +1,11 @@
 // The kernels of the registration for one instruction set. Compiled once per set, as kernels.cpp.
 #include "image_pyramid.h"
+#include "moved_depth.h"
 #include "registration_search.h"
 
 namespace raster {
 extern const RegistrationKernels REGISTRATION_TABLE;
 const RegistrationKernels REGISTRATION_TABLE = {KERNEL_ISA::align_at,      KERNEL_ISA::align,        KERNEL_ISA::gray_of_color,
                                                 KERNEL_ISA::gray_of_color, KERNEL_ISA::invert_depth, KERNEL_ISA::halve,
-                                                KERNEL_ISA::surface_normals};
+                                                KERNEL_ISA::surface_normals, KERNEL_ISA::move_depth};
 }  // namespace raster

@@ -86,11 +86,21 @@ struct NormalPixels {
     float fx, fy, cx, cy;
 };
 
+// A depth image, and the camera from another place that looks for its points.
+struct MovedDepth {
+    int width, height, rounds;
+    float middle, fx, fy, cx, cy, most_off_px2, same_surface;
+    float T_depth_color[12], T_color_depth[12];
+    const float *inverse_depth, *nearest;  // [h, w]
+    const float *ray_x, *ray_y;            // [w], [h]
+};
+
 // Memory of one thread, kept between calls.
 struct AlignmentScratch {
     Scratch<float> floats;
     Scratch<int32_t> indices;
     Scratch<uint32_t> keys;
+    Scratch<uint8_t> bytes;
 };
 
 // One build of these kernels for one instruction set.
@@ -107,6 +117,8 @@ struct RegistrationKernels {
     void (*invert_depth)(const float* depth_m, const uint8_t* mask, const float* sigma, size_t pixels, float* inverse, float* known_sigma);
     void (*halve)(const LevelImages&, const HalvedImages&);
     void (*surface_normals)(const LevelImages&, const NormalPixels&, float* normals);
+    // Inverse depth [h, w] (0: unknown), and columns and rows where it was looked up.
+    void (*move_depth)(const MovedDepth&, Scratch<uint8_t>&, float* found, float* columns, float* rows);
 };
 
 }  // namespace raster

@@ -122,6 +122,20 @@ static void surface_normals(const std::string& isa, const Inputs& inverse_depth,
     kernels_named(isa)->registration->surface_normals(level, {rows.size(), columns.size(), rows.data(), columns.data(), c[0], c[1], c[2], c[3]}, normals.data());
 }
 
+// numbers: start without a surface, fx, fy, cx, cy, limit of the squared distance in pixels, relative step of a surface.
+static void move_depth(const std::string& isa, const Inputs& inverse_depth, const Inputs& nearest, const Inputs& ray_x, const Inputs& ray_y,
+                       const Inputs& T_depth_color, const Inputs& T_color_depth, const Inputs& numbers, int rounds, const Floats& found,
+                       const Floats& columns, const Floats& rows) {
+    const float* n = numbers.data();
+    MovedDepth of = {static_cast<int>(ray_x.size()), static_cast<int>(ray_y.size()), rounds, n[0], n[1], n[2], n[3], n[4], n[5], n[6], {}, {},
+                     inverse_depth.data(), nearest.data(), ray_x.data(), ray_y.data()};
+    std::copy(T_depth_color.data(), T_depth_color.data() + 12, of.T_depth_color);
+    std::copy(T_color_depth.data(), T_color_depth.data() + 12, of.T_color_depth);
+    const RegistrationKernels* kernels = kernels_named(isa)->registration;
+    const nb::gil_scoped_release unlocked;
+    kernels->move_depth(of, alignment_scratch().bytes, found.data(), columns.data(), rows.data());
+}
+
 static void define_registration(nb::module_& m) {
     nb::class_<LevelArrays>(m, "LevelArrays")
         .def(nb::init<const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&,
@@ -135,6 +149,7 @@ static void define_registration(nb::module_& m) {
     m.def("invert_depth", invert_depth);
     m.def("halve", halve);
     m.def("surface_normals", surface_normals);
+    m.def("move_depth", move_depth);
 }
 
 }  // namespace raster

@@ -1,0 +1,81 @@
+"""The compiled search for points of a depth image computes what numpy defines, on every instruction set."""
+
+import numpy as np
+import pytest
+
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import available_isas, moved_depth, moved_depth_definition
+
+ISAS = available_isas()
+MOTIONS = {
+    "none": np.zeros(6),
+    "usual": np.array([0.03, -0.01, 0.02, 0.01, -0.02, 0.015]),
+    "ahead": np.array([0.0, 0.0, 1.2, 0.0, 0.0, 0.0]),
+    "turned away": np.array([0.1, 0.0, 0.0, 0.0, 2.5, 0.0]),
+    "farther than integers": np.array([1e9, 0.0, 0.0, 0.0, 0.3, 0.0]),
+}
+SIZES = {
+    "odd": (37, 23),
+    "two batches": (300, 40),
+    "one pixel": (1, 1),
+    "one row": (64, 1),
+    "one column": (1, 64),
+}
+
+
+def camera_of(width: int, height: int) -> PinholeCamera:
+    return PinholeCamera(width, height, 0.9 * width + 3, 0.8 * width + 3, 0.47 * width, 0.55 * height)
+
+
+def surfaces(camera: PinholeCamera, holes: float = 0.1) -> np.ndarray:
+    """Inverse depth of slanted planes at steps, with holes."""
+    rng = np.random.default_rng(camera.width)
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    inverse = 0.4 + 0.3 * u / camera.width + 0.2 * v / camera.height + 0.9 * ((u // 7 + v // 9) % 3 == 0)
+    return np.where(rng.random(inverse.shape) < holes, 0, inverse).astype(np.float32)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("size", SIZES)
+def test_points_are_those_of_the_definition(size: str, motion: str, isa: str) -> None:
+    camera, T = camera_of(*SIZES[size]), se3.exp(MOTIONS[motion])
+    inverse = surfaces(camera)
+    nearest = np.where(np.random.default_rng(1).random(inverse.shape) < 0.3, 0, inverse.max()).astype(
+        np.float32
+    )
+    found = moved_depth.found_points(inverse, nearest, 0.5, camera, T, isa=isa)
+    wanted = moved_depth_definition.found_points(inverse, nearest, 0.5, camera, T)
+    for ours, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(ours.view(np.int32), theirs.view(np.int32))
+
+
+def test_what_does_not_move_is_found_where_it_is() -> None:
+    camera = camera_of(64, 48)
+    inverse = surfaces(camera)
+    found, u, v = moved_depth.found_points(inverse, inverse, 0.5, camera, np.eye(4))
+    known = inverse > 0
+    assert (found[known] > 0).mean() > 0.99
+    np.testing.assert_allclose(found[known & (found > 0)], inverse[known & (found > 0)], rtol=1e-4)
+    rows, columns = np.nonzero(known & (found > 0))
+    np.testing.assert_allclose(u[rows, columns], columns, atol=1e-3)
+    np.testing.assert_allclose(v[rows, columns], rows, atol=1e-3)
+
+
+def test_an_image_without_depth_has_no_points() -> None:
+    camera = camera_of(40, 30)
+    nothing = np.zeros((30, 40), np.float32)
+    assert not moved_depth.found_points(nothing, nothing, 1.0, camera, se3.exp(MOTIONS["usual"]))[0].any()
+
+
+def test_images_of_another_size_and_no_start_are_refused() -> None:
+    camera = camera_of(40, 30)
+    image = np.ones((30, 40), np.float32)
+    with pytest.raises(ValueError, match=r"nearest is float32 \(30, 39\), expected float32 \(30, 40\)"):
+        moved_depth.found_points(image, image[:, :39], 1.0, camera, np.eye(4))
+    with pytest.raises(ValueError, match=r"inverse_depth is float64 \(30, 40\)"):
+        moved_depth.found_points(image.astype(float), image, 1.0, camera, np.eye(4))
+    for middle in (0.0, float("nan")):
+        with pytest.raises(ValueError, match="expected more than 0"):
+            moved_depth.found_points(image, image, middle, camera, np.eye(4))
