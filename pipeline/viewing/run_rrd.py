@@ -126,6 +126,10 @@ def thinned(gaussians: Gaussians, most: int) -> NDArray[np.int64]:
 
 
 def _log_map(stream: rr.RecordingStream, entity: str, robot: RobotRun, max_gaussians: int) -> None:
+    if robot.refined_map is not None:
+        final = robot.refined_map.gaussians
+        final = final.select(thinned(final, max_gaussians))
+        stream.log(f"{entity}/final", splats(final, final.colors), static=True)
     fused = robot.fused_map
     chosen = thinned(fused.gaussians, max_gaussians)
     shown = fused.gaussians.select(chosen)
@@ -260,8 +264,15 @@ def _summary(run: RunFolder) -> str:
     return "\n".join(lines)
 
 
+def _maps_shown(run: RunFolder) -> list[tuple[str, str, str]]:
+    """Robot, kind and title of the maps that have a tab: the final ones of the largest component, then more of one."""
+    first, members = run.largest_component[0], [n for n in run.largest_component if n in run.robots]
+    final = [(name, "final", "final map") for name in members if run.robots[name].refined_map is not None]
+    return [*final, (first, "fused", "fused map"), (first, "uncertainty", "σ along the normal")]
+
+
 def _blueprint(run: RunFolder) -> rrb.Blueprint:
-    """One robot's map with all paths, its uncertainty, the images, the rounds, the network and the numbers."""
+    """Maps with all paths, uncertainty of one, the images, the rounds, the network and the numbers."""
     import rerun.blueprint as rrb
 
     first = run.largest_component[0]
@@ -297,11 +308,11 @@ def _blueprint(run: RunFolder) -> rrb.Blueprint:
                     *(
                         rrb.Spatial3DView(
                             origin=f"/{world}",
-                            contents=[*scene, f"/{world}/maps/{first}/{coloring}"],
-                            name=name,
+                            contents=[*scene, f"/{world}/maps/{name}/{kind}"],
+                            name=f"{name}: {title}",
                             eye_controls=eye,
                         )
-                        for coloring, name in (("fused", "Fused map"), ("uncertainty", "σ along the normal"))
+                        for name, kind, title in _maps_shown(run)
                     )
                 ),
                 rrb.Vertical(*images),

@@ -169,7 +169,10 @@ def _sections(config: Config, path: str) -> Iterator[str]:
 
 def _table_of(model: type[Config]) -> str:
     """The settings of a model as a table, with its own defaults."""
-    rows = [_row(n, REQUIRED if f.is_required() else f.default, f) for n, f in model.model_fields.items()]
+    rows = [
+        _row(name, REQUIRED if f.is_required() else f.get_default(call_default_factory=True), f)
+        for name, f in model.model_fields.items()
+    ]
     return table(("key", "default", "type", "meaning"), rows)
 
 
@@ -209,6 +212,8 @@ def _type_name(kind: Any) -> str:
         return " or ".join(_plain(word) for word in typing.get_args(kind))
     if hasattr(kind, "__value__"):
         return _type_name(kind.__value__)
+    if typing.get_origin(kind) is typing.Annotated:
+        return _type_name(typing.get_args(kind)[0])
     words = {"int": "integer", "float": "number", "bool": "true or false", "str": "text"}
     if isinstance(kind, type) and not typing.get_args(kind):
         return words.get(kind.__name__, kind.__name__)

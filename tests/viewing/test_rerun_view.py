@@ -7,6 +7,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.viewing import rerun_view, run_rrd
 from tests.fixtures.fake_run import FRAMES, KEYFRAMES, FakeRun, make, wall
 
@@ -68,7 +69,7 @@ def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
     for robot in ("alpha", "bravo"):
         for path in ("before_consensus", "after_consensus", "ground_truth"):
             assert found[f"/world/paths/{robot}/{path}"]["LineStrips3D:strips"] == 1
-        for coloring in ("fused", "uncertainty"):
+        for coloring in ("final", "fused", "uncertainty"):
             assert found[f"/world/maps/{robot}/{coloring}"]["GaussianSplats3D:centers"] == 1
         camera = found[f"/world/cameras/{robot}"]
         assert camera["Pinhole:image_from_camera"] == 1
@@ -94,6 +95,7 @@ def test_robots_that_never_met_share_no_world(tmp_path):
     fake = make(tmp_path, joined=False, truth=False)
     found = of_rrd(run_rrd.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
     assert "/world/maps/alpha/fused" in found
+    assert run_rrd._maps_shown(RunFolder(fake.run))[-1] == ("alpha", "uncertainty", "σ along the normal")
     assert "/world_of_bravo/maps/bravo/fused" in found
     assert "/world/paths/alpha/ground_truth" not in found
 
