@@ -283,6 +283,7 @@ class _ComponentStage:
             path: of the log.
         """
         log, clock, save = self.log, self.clock, self.checkpoints
+        log.move_depth(*_trajectories(tracked))  # those of another component say nothing of these frames
         part = f"{self.name}.poses"
 
         def optimize() -> OptimizedPath:
