@@ -38,6 +38,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -107,6 +108,12 @@ def settle_clocks(recording: RecordingWriter, robot_logs: Mapping[str, RobotLog]
             robot_log.shift_ns += round(offset.seconds * NANOSECONDS)
         elif kind == "estimated" and offset.seconds is None:
             robot_log.warnings.append(f"its clock is kept: {offset.how}")
+    for robot_log in robot_logs.values():
+        if (begin_ns := robot_log.written_ns(min(robot_log.pairs))) < 0:
+            raise DuagError(
+                f"{robot_log.name}: begins at {begin_ns / NANOSECONDS:.1f} s by the settled clocks, expected 0 s; "
+                "--set clock_offset_s=SECONDS, the same for every robot, moves all of them"
+            )
     if len(robot_logs) > 1:
         recording.clocks = {
             robot: {**offsets[robot].row(), "added_s": robot_log.shift_ns / NANOSECONDS}
@@ -210,7 +217,13 @@ def _farthest_m(source: RobotLog) -> float:
     """Distance from which on depth images say nothing, meters; 0: all depth counts."""
     if source.settings.farthest_m or source.derived is not None:
         return source.settings.farthest_m
-    found_m, share = farthest_measured_m(source.log, source.depth, source.settings.depth_scale)
+    held_out = {source.pairs[color] for index, color in enumerate(sorted(source.pairs)) if is_held_out(index)}
+    found_m, share = farthest_measured_m(
+        source.log,
+        source.depth,
+        source.settings.depth_scale,
+        lambda entry: source.time_ns(entry) not in held_out,
+    )
     if found_m:
         source.warnings.append(
             f"{share:.0%} of {source.depth} is exactly {found_m:.3f} m, far beyond all other: taken for none; "

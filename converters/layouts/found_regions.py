@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from duagc.converters.layouts.own_body import OwnBody
 from duagc.converters.layouts.validity import BlackBorder
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry.masks import Mask
 
 EVERY, EVERY_NS = 8, 250_000_000  # a frame of so many is looked at, and one in so long a time
-MANY = 32  # frames; of these twice as many are looked at, so that short recordings tell
+EVERY_OF_FIRST, MANY = 3, 32  # of the first frames more are looked at, so that short recordings tell
 
 
 class FoundRegions:
@@ -21,7 +22,7 @@ class FoundRegions:
         self._next_look_ns = 0
 
     def add(self, index: int, stamp_ns: int, color: bytes, depth: NDArray[np.uint16] | None) -> None:
-        """Take the next frame, and look at it if it is its turn.
+        """Take the next frame, and look at it if it is its turn; never at one that is held out.
 
         Args:
             index: of the frame.
@@ -29,8 +30,8 @@ class FoundRegions:
             color: the encoded color image.
             depth: [h, w], 0 = none; None: the frame has none.
         """
-        every = EVERY if index >= MANY else EVERY // 2
-        if index % every and stamp_ns < self._next_look_ns:
+        every = EVERY if index >= MANY else EVERY_OF_FIRST
+        if is_held_out(index) or (index % every and stamp_ns < self._next_look_ns):
             return
         self._next_look_ns = stamp_ns + EVERY_NS
         self._black.add(color)

@@ -25,6 +25,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -189,7 +190,10 @@ def write(
 
 def _unmeasured(clip: Clip) -> tuple[int, float]:
     """The depth, in units, that a camera gives where it measures nothing, and its share; 0: it gives none."""
-    files = list(dict.fromkeys(frame.depth for frame in clip.frames if frame.depth is not None))
+    held_out = {frame.depth for index, frame in enumerate(clip.frames) if is_held_out(index)}
+    files = list(
+        dict.fromkeys(f.depth for f in clip.frames if f.depth is not None and f.depth not in held_out)
+    )
     some = files[: LOOKED_AT_EVERY * LOOKED_AT : LOOKED_AT_EVERY]
     size = clip.camera.width, clip.camera.height
     greatest, share = unmeasured([read_depth(path, size, no_depth=clip.no_depth) for path in some])

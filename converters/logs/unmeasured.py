@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.ros_images import depth_values, in_meters, is_cut_short
+from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
 from duagc.pipeline.recording.greatest_depth import unmeasured
 
 EVERY, IMAGES = 8, 8  # the first images of a log that are looked at
 
 
-def farthest_measured_m(log: Log, topic: str, scale: float) -> tuple[float, float]:
+def farthest_measured_m(
+    log: Log, topic: str, scale: float, is_mapped: Callable[[Entry], bool]
+) -> tuple[float, float]:
     """Distance in meters from which on depth is none, and its share of the known depth; 0: all depth counts.
 
     Args:
         log: the log.
         topic: of its depth images.
         scale: meters per unit of integer depth.
+        is_mapped: whether a depth image is of no frame that is held out.
     """
     images: list[NDArray[np.float32]] = []
+    due = 0
     for number, entry in enumerate(log.entries(topic)):
-        if number >= EVERY * IMAGES:
+        if due >= EVERY * IMAGES:
             break
-        if number % EVERY == 0 and not is_cut_short(message := entry.read()):
-            images.append(in_meters(depth_values(message, f"{log.name}: {topic}"), scale))
+        if number >= due and is_mapped(entry):
+            due += EVERY
+            if not is_cut_short(message := entry.read()):
+                images.append(in_meters(depth_values(message, f"{log.name}: {topic}"), scale))
     return unmeasured(images)

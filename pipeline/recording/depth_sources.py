@@ -19,6 +19,7 @@ from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.recording.depth_steps import COARSE_PER_M, inverse_step_per_m, without_steps
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.names import DEPTH_SCALE_KEY, RANGE_SIGMA_KEY
+from duagc.pipeline.recording.pairing import pair
 from duagc.pipeline.recording.read import LogFile, Record
 from duagc.pipeline.recording.register_depth import register_depth
 from duagc.schemas import topics as topic_table
@@ -71,7 +72,8 @@ class Registered:
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
         self.topic, self.camera = topic_table.DEPTH.of(robot), camera
         self.scale = _meters(log, self.topic, DEPTH_SCALE_KEY)
-        self._steps = _Steps(log, self.topic, self.scale, camera)
+        color_topic = topic_table.COLOR.of(robot)
+        self._steps = _Steps(log, self.topic, self.scale, camera, color_topic=color_topic)
         self._log, self._sigma_topic = log, topic_table.DEPTH_SIGMA.of(robot)
         self._sigma_at = log.entries_by_time(self._sigma_topic)
         if self._sigma_at:
@@ -101,7 +103,8 @@ class OtherCamera:
         self.depth_camera = constant(log, calibration, messages.unpack_calibration)
         transform = topic_table.RAW_DEPTH_TRANSFORM.of(robot)
         self.T_camera_depth = np.array(constant(log, transform, transform_rows))
-        self._steps = _Steps(log, self.topic, self.scale, self.depth_camera)
+        color_topic = topic_table.COLOR.of(robot)
+        self._steps = _Steps(log, self.topic, self.scale, self.depth_camera, color_topic=color_topic)
 
     def read(self, record: Record) -> DepthImage:
         depth_m = self._steps.smoothed(_depth_image(record, self.scale, self.depth_camera))
@@ -130,14 +133,18 @@ class Lidar:
 class _Steps:
     """Takes the steps out of the depth images of a topic, where they are coarse; found in some of its images."""
 
-    def __init__(self, log: LogFile, topic: str, scale: float, camera: PinholeCamera) -> None:
-        self._log, self._topic, self._scale, self._camera = log, topic, scale, camera
+    def __init__(
+        self, log: LogFile, topic: str, scale: float, camera: PinholeCamera, *, color_topic: str
+    ) -> None:
+        self._log, self._topic, self._color_topic = log, topic, color_topic
+        self._scale, self._camera = scale, camera
 
     @cached_property
     def _step_per_m(self) -> float:
-        entries = self._log.entries(self._topic)
-        # a depth image is that of the frame of its number, or of one near it
-        mapped = [entry for k, entry in enumerate(entries) if not is_held_out(k)]
+        at = self._log.entries_by_time(self._topic)
+        frames = pair(self._log.entries_by_time(self._color_topic), at).pairs
+        held_out = {depth for index, (_, depth) in enumerate(frames) if is_held_out(index)}
+        mapped = [entry for stamp, entry in sorted(at.items()) if stamp not in held_out]
         some = [mapped[k] for k in evenly_spaced(len(mapped), min(STEP_IMAGES, len(mapped)))]
         records = [self._log.record_at(self._topic, entry) for entry in some]
         return inverse_step_per_m([_depth_image(r, self._scale, self._camera) for r in records], self._scale)

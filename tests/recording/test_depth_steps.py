@@ -10,6 +10,7 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import depth_sources, open_rgbd
 from duagc.pipeline.recording.depth_steps import COARSE_PER_M, inverse_step_per_m, without_steps
+from duagc.pipeline.recording.pairing import pair
 from tests.fixtures.recording_logs import png, write_camera
 
 CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -91,22 +92,27 @@ def test_a_log_is_read_without_coarse_steps(tmp_path: Path, step: float, smoothe
     assert np.array_equal(found, seen) != smoothed
 
 
+@pytest.mark.parametrize("dropped", [(), (0, 3)], ids=["all", "without two"])
 @pytest.mark.parametrize("images", [1, 5, 40, 200, 1000])
-def test_images_of_held_out_frames_say_nothing_of_steps(monkeypatch: pytest.MonkeyPatch, images: int) -> None:
+def test_images_of_held_out_frames_say_nothing_of_steps(
+    monkeypatch: pytest.MonkeyPatch, images: int, dropped: tuple[int, ...]
+) -> None:
+    """Frames are those of the color images, whatever depth images are missing."""
     looked_at: list[int] = []
 
     class Log:
-        def entries(self, _topic: str) -> list[int]:
-            return list(range(images))
+        def entries_by_time(self, topic: str) -> dict[int, int]:
+            return {k: k for k in range(images) if topic == "color" or k not in dropped}
 
         def record_at(self, _topic: str, entry: int) -> int:
             looked_at.append(entry)
             return entry
 
     monkeypatch.setattr(depth_sources, "_depth_image", lambda *_: np.ones((4, 4), np.float32))
-    steps = depth_sources._Steps(Log(), "depth", 0.001, PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5))
+    camera = PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5)
+    monkeypatch.setattr(depth_sources, "pair", lambda color, depth: pair(color, depth, 0))
+    steps = depth_sources._Steps(Log(), "depth", 0.001, camera, color_topic="color")
     steps.smoothed(np.ones((4, 4), np.float32))
-    assert len(looked_at) == min(
-        images, depth_sources.STEP_IMAGES, len([k for k in range(images) if k % 8 != 4])
-    )
+    mapped = [k for k in range(images) if k % 8 != 4 and k not in dropped]
+    assert len(looked_at) == min(depth_sources.STEP_IMAGES, len(mapped))
     assert not any(is_held_out(k) for k in looked_at)

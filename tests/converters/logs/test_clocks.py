@@ -5,14 +5,17 @@ from __future__ import annotations
 import copy
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from duagc.converters import registry
+from duagc.converters.datasets import ros
 from duagc.converters.logs import clocks
 from duagc.converters.logs.describe import describe
+from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks.check import check
 from duagc.pipeline.geometry import so3
@@ -129,6 +132,22 @@ def test_messages_in_both_directions_bound_the_difference(tmp_path: Path) -> Non
     assert stated["high_s"] - stated["low_s"] < 0.025
     assert stated["how"] == "40 messages that both recorded, sent by both"
     assert abs(start(tmp_path / "rec", "jackal") - start(tmp_path / "rec", "husky")) < 6_000_000
+
+
+def test_clocks_that_lead_before_their_beginning_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stamps since the start of a computer, which another one started earlier."""
+    second = 1_000_000_000
+
+    class Log:
+        name, shift_ns, pairs = "b.bag", 0, {50 * second: None}
+        settings = LogOptions(clocks="estimated")
+        settle_drift = clock = written_ns = lambda self, stamp_ns=0: stamp_ns + self.shift_ns
+
+    offset = SimpleNamespace(seconds=-100.0, matters=True)
+    monkeypatch.setattr(ros, "compare", lambda _: {"b": offset})
+    monkeypatch.setattr(Log, "clock", lambda self, robot: robot)
+    with pytest.raises(DuagError, match=r"b.bag: begins at -50.0 s by the settled clocks, expected 0 s"):
+        ros.settle_clocks(SimpleNamespace(warnings=[]), {"b": Log()})
 
 
 def test_one_direction_bounds_one_side(tmp_path: Path) -> None:
