@@ -23,6 +23,7 @@ FULL_ROUNDS = 2
 WINDOW_ROUNDS, MOST_WINDOW_ROUNDS = 3, 12
 MOST_ROUNDS = 32  # that a sender pauses or holds, whatever is reported
 LEAST_HEARD = 8  # packets in the window; it is as long as it takes to hear them, or says nothing
+MOST_BYTES_PER_ROUND = 2**32 - 1  # that a report has room for
 LEAST_BUDGET_BYTES = 2_400  # acknowledgements and states always go
 DECREASE = 0.9
 FIRST_INCREASE, LARGEST_INCREASE = 0.05, 0.5
@@ -138,7 +139,8 @@ def _carried(rounds: Sequence[_Round], round_index: int) -> int:
     spans = sum(train.last - train.first for train in trains.values())
     within = sum(train.heard - 1 for train in trains.values())
     share = within / spans if within else 1.0
-    return int(sum(r.bytes for r in rounds) / share / max(WINDOW_ROUNDS, 1 + round_index - rounds[-1].index))
+    carried = sum(r.bytes for r in rounds) / share / max(WINDOW_ROUNDS, 1 + round_index - rounds[-1].index)
+    return min(int(carried), MOST_BYTES_PER_ROUND)  # sequence numbers may be anything that a sender writes
 
 
 class SendRate:

@@ -156,7 +156,9 @@ class LinkModel:
             return Fate((), LOST)
         if self._in_burst(radio, *ends, start_ns) and draws.next() < config.burst_loss_probability:
             return Fate((), BURST)
-        arrival_ns = start_ns + on_air_ns + config.latency_ns
+        arrival_ns = max(
+            start_ns + on_air_ns + config.latency_ns, send_ns + 1
+        )  # it was sent before it is there
         copies = 1 + (config.duplicate_probability > 0.0 and draws.next() < config.duplicate_probability)
         return Fate(tuple(sorted(arrival_ns + self._jitter_ns(draws) for _ in range(copies))))
 

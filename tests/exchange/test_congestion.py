@@ -14,7 +14,7 @@ from duagc.pipeline.config.network import LinkConfig, TransportConfig
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.network.congestion import MOST_ROUNDS, Congestion, SendRate
+from duagc.pipeline.network.congestion import MOST_ROUNDS, Congestion, LinkObserver, SendRate
 from duagc.pipeline.network.link_model import LinkModel
 from duagc.pipeline.network.messages import Message
 from duagc.pipeline.network.packets import Kind, parse
@@ -110,6 +110,20 @@ def test_a_false_report_delays_a_little_and_once() -> None:
     assert rate.take(Congestion(60_000, 0, 7), 8) == MOST_ROUNDS
     assert rate.take(Congestion(60_000, 0, 7), 9) == 0
     assert rate.budget(BUDGET_BYTES, 9) < rate.budget(BUDGET_BYTES, 9 + MOST_ROUNDS) + 2
+
+
+def test_a_number_that_no_link_reaches_is_reported_all_the_same() -> None:
+    """A sequence number may be anything that somebody writes; what is reported fits its field."""
+    observer = LinkObserver()
+    for k in range(20):
+        observer.heard(k, 0, 0, 1200)
+    for sequence in (20, 2**32 - 1):
+        observer.heard(sequence, 1, 5, 1200)
+    for k in range(21, 40):
+        observer.heard(k, 1, 5, 1200)
+    said = observer.congestion(5)
+    assert said is not None
+    assert 0 <= said.bytes_per_round < 2**32
 
 
 def test_what_arrived_counts_when_a_contact_ends(make_robot: Any, tmp_path: Any) -> None:

@@ -108,6 +108,11 @@ def test_duplicates_come_with_their_own_delay() -> None:
     assert sum(f.deliver_ns[0] != f.deliver_ns[1] for f in twice) > 0.9 * len(twice)
 
 
+def test_nothing_is_there_when_it_is_sent() -> None:
+    """Or a replay, which knows all packets, would deliver it a round earlier than the session did."""
+    assert {f.deliver_ns for f in fates(LinkConfig(latency_ns=0), 3, every_ns=0)} == {(1,)}
+
+
 def test_a_bandwidth_holds() -> None:
     """1000 bytes at 100 kB/s take 10 ms each; what would wait longer than the queue allows is dropped."""
     config = LinkConfig(latency_ns=0, bandwidth_bytes_per_s=100_000, queue_ns=95 * MS)
