@@ -109,14 +109,14 @@ class McapFile:
             self.topics[channel.topic] = LogTopic(channel.topic, kind, name, encoding, total)
 
     def _records(self) -> Iterator[Any]:
-        """Schemas, channels and messages in the order of the file."""
-        self._stream.seek(0)
-        for record in StreamReader(self._stream, emit_chunks=True, record_size_limit=LARGEST_CHUNK).records:
-            if isinstance(record, Chunk):
-                self._check_size(record)
-                yield from breakup_chunk(record, validate_crc=True)
-            else:
-                yield record
+        """Schemas, channels and messages in the order of the file; several may be on their way."""
+        with self.path.open("rb") as stream:
+            for record in StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_CHUNK).records:
+                if isinstance(record, Chunk):
+                    self._check_size(record)
+                    yield from breakup_chunk(record, validate_crc=True)
+                else:
+                    yield record
 
     def _beginning(self, offset: int) -> Chunk:
         """A chunk with no more of its records than tell their unpacked size."""

@@ -122,6 +122,12 @@ def _from_file(path: Path, options: Mapping[str, Any]) -> list[Source]:
                 f"{path}: {option} is said, expected `logs` and `namespace` of each robot instead"
             )
     _check_names(content, f"{path}")
+    if len(robots) > 1 and (content.get("truth_file") or options.get("truth_file")):
+        raise DuagError(
+            f"{path}: truth_file is said for several robots, expected it in [robots.NAME] of each"
+        )
+    if isinstance(content.get("truth_file"), str):
+        content["truth_file"] = str(path.parent / content["truth_file"])
     sources = []
     for name in sorted(robots):
         where = f"{path}: [robots.{name}]"

@@ -109,6 +109,23 @@ def test_a_topic_that_is_said_is_of_one_robot(tmp_path: Path) -> None:
         )
 
 
+def test_a_file_of_true_poses_is_of_one_robot(tmp_path: Path) -> None:
+    r = Ros(2)
+    for name in ("a", "b"):
+        write(tmp_path / f"{name}.mcap", scene(r), "protobuf", r)
+    rows = "".join(f'[robots.{name}]\nlogs = ["{name}.mcap"]\n' for name in ("a", "b"))
+    (tmp_path / "team.toml").write_text(rows)
+    (tmp_path / "said.toml").write_text(f'truth_file = "gt.tum"\n{rows}')
+    for listed, options in ((tmp_path / "said.toml", []), (tmp_path / "team.toml", ["truth_file=gt.tum"])):
+        with pytest.raises(
+            DuagError, match=r"truth_file is said for several robots, expected it in \[robots"
+        ):
+            registry.convert("ros", listed, tmp_path / "rec", options=options)
+    (tmp_path / "one.toml").write_text('truth_file = "gt.tum"\n[robots.a]\nlogs = ["a.mcap"]\n')
+    with pytest.raises(DuagError, match=f"{tmp_path / 'gt.tum'}: No such file"):  # next to the TOML file
+        registry.convert("ros", tmp_path / "one.toml", tmp_path / "rec")
+
+
 def test_what_is_not_decided_lists_its_candidates(tmp_path: Path) -> None:
     r = Ros(1)
     rows = scene(r) + [

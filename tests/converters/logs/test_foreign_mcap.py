@@ -60,6 +60,21 @@ def test_every_encoding_gives_the_same_recording(
     assert report.sound, report.findings
 
 
+def test_a_log_without_an_index_may_be_read_twice_at_a_time(tmp_path: Path) -> None:
+    """As when the first true pose is looked up while images are converted."""
+    r = Ros(2)
+    path = write(tmp_path / "log.mcap", scene(r), "protobuf", r, use_chunking=False)
+    with open_log([path]) as log:
+        topics = list(log.topics)
+        alone = [(entry.topic, entry.log_ns) for topic in topics for entry in log.entries(topic)]
+        together = []
+        for topic in topics:
+            for entry, other in zip(log.entries(topic), log.entries(topic), strict=True):
+                assert (entry.topic, entry.log_ns) == (other.topic, other.log_ns)
+                together.append((entry.topic, entry.log_ns))
+    assert together == alone
+
+
 def test_pieces_of_a_log_are_one_log(tmp_path: Path, expected: dict[str, str]) -> None:
     """Cut in time, in containers of different kinds, in the order of their numbers: the same recording."""
     r, r1 = Ros(2), Ros(1)
