@@ -1,7 +1,6 @@
 """Open3D where system libraries of windows and USB cameras are missing."""
 
 import ctypes
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -102,10 +101,10 @@ def test_a_stand_in_that_is_called_stops_the_process_with_one_line() -> None:
 def test_what_keeps_it_from_starting_is_one_line(
     complaint: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(name: str) -> None:
+    def refuse() -> None:
         raise ImportError(complaint)
 
-    monkeypatch.setattr(importlib, "import_module", refuse)
+    monkeypatch.setattr(open3d_import, "_imported", refuse)
     monkeypatch.setattr(open3d_import, "STAND_INS", tmp_path)  # empty
     monkeypatch.setattr(open3d_import, "_kept", {})
     with pytest.raises(DuagError) as raised:
@@ -118,10 +117,10 @@ def test_a_stand_in_that_lacks_a_function_names_the_package(
 ) -> None:
     complaints = ["libEGL.so.1: cannot open shared object file", "libOpen3D.so: undefined symbol: eglNew"]
 
-    def refuse(name: str) -> None:
+    def refuse() -> None:
         raise ImportError(complaints.pop(0))
 
-    monkeypatch.setattr(importlib, "import_module", refuse)
+    monkeypatch.setattr(open3d_import, "_imported", refuse)
     monkeypatch.setattr(open3d_import, "STAND_INS", tmp_path)
     monkeypatch.setattr(open3d_import, "_kept", {})
     monkeypatch.setattr(ctypes, "CDLL", lambda path: path)

@@ -45,11 +45,17 @@ def import_open3d() -> Any:
     while True:  # each time, the linker names one library that it lacks
         try:
             with _web_viewer_by_need():
-                return importlib.import_module("open3d")
+                return _imported()
         except ImportError as error:
             missing = _NOT_FOUND.match(str(error))
             if missing is None or not _load_stand_in(missing[1]):
                 raise DuagError(_advice(str(error))) from error
+
+
+def _imported() -> Any:
+    import open3d  # a statement, which says that results depend on its version
+
+    return open3d
 
 
 @contextmanager

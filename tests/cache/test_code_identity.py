@@ -129,3 +129,7 @@ def test_every_stage_counts_its_own_folder_and_the_compiled_kernels() -> None:
     assert "schemas/descriptors.binpb" in of["exchange"]
     for name, other in (("frontend", "fusion"), ("information", "frontend"), ("fusion", "exchange")):
         assert not [module for module in of[name] if module.startswith(f"pipeline/{other}/")]
+
+
+def test_results_depend_on_the_version_of_open3d_where_it_is_used() -> None:
+    assert "open3d" in CodeReader().version_of("duagc.pipeline.steps:frontend").libraries
