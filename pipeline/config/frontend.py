@@ -169,9 +169,9 @@ class FailureConfig(Config):
     """With `slack_m`, how far from where it was predicted a camera may be found on a surface without features."""
     min_features_of_inliers: int = 3
     """Times `relocalization.min_inliers`: a keyframe with fewer features cannot decide where a view is."""
-    usual_frames: int = 50
+    usual_frames: PositiveInt = 50
     """Last frames that were followed, whose median gray residual is the usual one."""
-    interval_frames: int = 50
+    interval_frames: PositiveInt = 50
     """Last frames whose median interval is the usual one."""
     gap_intervals: float = 3
     """Median times between frames without any that count as a gap."""

@@ -43,6 +43,8 @@ BLOCKS_PER_SAMPLE = 30.0
 """Blocks that say together what one would say alone: neighbors share their errors."""
 SMOOTH = 0.02
 """Relative standard deviation of the inverse depth in a block up to which it shows one surface."""
+MOST_ROWS = 16_384
+"""Of an image that OpenCV is given: it takes less than 32,767."""
 ROUNDS_OF_PAIR = 8
 """Of reweighting, for the colors of a pair."""
 ROUNDS = 8
@@ -122,14 +124,19 @@ class ColorBlocks:
             return np.zeros((0, 3)), np.zeros((0, 3))
         at = other.camera.project(there).astype(np.float32)
         channels = np.concatenate([other.color, other.inverse_depth[..., None]], axis=2)
-        found = cv2.remap(
-            channels,
-            at[:, :1],
-            at[:, 1:],
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=(np.nan,) * 4,
-        ).reshape(-1, 4)
+        found = np.concatenate(
+            [
+                cv2.remap(
+                    channels,
+                    part[:, :1],
+                    part[:, 1:],
+                    cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_CONSTANT,
+                    borderValue=(np.nan,) * 4,
+                ).reshape(-1, 4)
+                for part in np.split(at, range(MOST_ROWS, len(at), MOST_ROWS))
+            ]
+        )
         with np.errstate(invalid="ignore"):
             same = np.abs(found[:, 3] * there[:, 2] - 1) < SAME_SURFACE
         same &= np.isfinite(found).all(axis=1)

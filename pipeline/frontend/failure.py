@@ -122,7 +122,7 @@ class FrameIntervals:
         """
         if self._last_ns is not None:
             interval_s = (stamp_ns - self._last_ns) * 1e-9
-            self._intervals_s = (*self._intervals_s[1 - self._frames :], interval_s)
+            self._intervals_s = (*self._intervals_s, interval_s)[-self._frames :]
         self._last_ns = stamp_ns
 
     @property

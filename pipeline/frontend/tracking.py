@@ -247,7 +247,7 @@ class Tracker:
         self._relocalizer.reset()
         if followed and found.without is Reason.NONE:
             frames = state.config.tracking.failure.usual_frames
-            state.gray_rms = [*state.gray_rms[1 - frames :], result.rms_gray]
+            state.gray_rms = [*state.gray_rms, result.rms_gray][-frames:]
 
     def _update_view(self, frame: CurrentFrame, found: PoseCandidate) -> None:
         """What is in front of the camera, by a frame with depth and color; and the last good frame."""

@@ -229,3 +229,13 @@ def test_a_map_of_wandering_exposures_is_nearly_as_good_as_one_of_a_constant_one
         sigmas[name] = information.color_sigma
     assert scores["wandering"] > max(scores["constant"] - 4, 43)
     assert sigmas["wandering"] < sigmas["constant"] + 0.005
+
+
+def test_frames_are_compared_in_as_many_blocks_as_are_asked_for() -> None:
+    """More than OpenCV takes as rows of one image."""
+    camera = PinholeCamera(320, 240, 260.0, 260.0, 159.5, 119.5)
+    color = np.random.default_rng(0).integers(20, 200, (240, 320, 3)).astype(np.uint8)
+    blocks = ColorBlocks.of(RgbdFrame(0, 0, color, np.full((240, 320), 2, np.float32)), camera, width_px=320)
+    own, other = blocks.shared_with(blocks, np.eye(4))
+    assert len(own) > 70_000
+    np.testing.assert_allclose(own, other, atol=1e-3)
