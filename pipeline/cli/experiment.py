@@ -88,7 +88,7 @@ def run(
     from duagc.pipeline.batch.engines import engine_of
     from duagc.pipeline.cache.store import Store, default_store
     from duagc.pipeline.experiments.carry_out import carry_out, check_packages, check_place, check_recordings
-    from duagc.pipeline.experiments.pages import PAGE, judge_folder, write_report
+    from duagc.pipeline.experiments.pages import PAGE, judge_folder, results_in, write_report
     from duagc.pipeline.experiments.predicted import predicted_each_s, time_left_s
     from duagc.pipeline.experiments.rule import experiment_names, read_experiment
 
@@ -102,6 +102,7 @@ def run(
         experiment.profile(profile)
         check_packages(experiment, profile)
         check_place(experiment, profile, out)
+    results_in(out)  # those that are there already come into the page
     check_recordings(chosen, recordings)
     place = store or default_store(out / "run")
     Store(place)  # what is none is refused before anything is simulated

@@ -315,9 +315,19 @@ def code_digest(store: Path, experiment: Experiment, profile: Profile) -> str:
         profile: how much is computed.
     """
     used = stages.STAGES[: 1 + stages.STAGES.index(stages.EVALUATION)]
-    data = (data_of(experiment.file, profile, name) for name in experiment.file.configurations)
-    steering = [STEERING] if any(one.steering for one in data) else []
+    steering = [STEERING] if is_steered(experiment, profile) else []
     return _digest_of([SIMULATOR, *steering, *(stage.code for stage in used)], store)
+
+
+def is_steered(experiment: Experiment, profile: Profile) -> bool:
+    """Whether a robot of an experiment is steered while it is simulated.
+
+    Args:
+        experiment: the experiment.
+        profile: how much is computed.
+    """
+    data = (data_of(experiment.file, profile, name) for name in experiment.file.configurations)
+    return any(one.steering for one in data)
 
 
 def simulator_digest(store: Path, data: SimulatedData, profile: Profile) -> str:

@@ -13,7 +13,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.random_streams import generator
 from duagc.pipeline.base.templates import filled
 from duagc.pipeline.cache.publish import publish
-from duagc.pipeline.experiments.carry_out import RESULT, check_rule, read_result
+from duagc.pipeline.experiments.carry_out import RESULT, check_rule, is_steered, read_result
 from duagc.pipeline.experiments.costs import write_costs
 from duagc.pipeline.experiments.overview import counted, judged_uses, read_uses
 from duagc.pipeline.experiments.rule import RULES, Experiment, Metric, Rule, read_experiment
@@ -61,20 +61,36 @@ def judge_folder(out: Path, rules: Path = RULES) -> list[JudgedExperiment]:
     Raises:
         DuagError: there is no result, or one was made under another rule.
     """
-    paths = sorted(out.glob(f"*/{RESULT}"))
-    if not paths:
+    found = results_in(out, rules)
+    if not found:
         raise DuagError(f"{out}: found no {RESULT}, expected what `duagc experiment run` writes")
     judged = []
-    for path in paths:
-        result = read_result(path)
-        experiment = read_experiment(path.parent.name, rules)
-        check_rule(experiment, result, path)
-        experiment.profile(result["profile"])
+    for experiment, result in found:
         rows = rows_of(result)
         judged.append(
             JudgedExperiment(experiment, result, rows, judge(experiment.name, experiment.file, rows))
         )
     return judged
+
+
+def results_in(out: Path, rules: Path = RULES) -> list[tuple[Experiment, dict[str, Any]]]:
+    """The experiments that have a result in a folder, and these; a page can be made of them.
+
+    Args:
+        out: folder of all experiments.
+        rules: folder of their files.
+
+    Raises:
+        DuagError: one was made under another rule.
+    """
+    found = []
+    for path in sorted(out.glob(f"*/{RESULT}")):
+        result = read_result(path)
+        experiment = read_experiment(path.parent.name, rules)
+        check_rule(experiment, result, path)
+        experiment.profile(result["profile"])
+        found.append((experiment, result))
+    return found
 
 
 def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
@@ -87,8 +103,7 @@ def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
     sections = [_section(one) for one in judged]
     for one, section in zip(judged, sections, strict=True):
         _write(out / one.experiment.name / FIGURE, section["figure"])
-    codes = {one.result.get("code_sha256") for one in judged}
-    package, mixed = "duagc.pipeline.experiments", len(codes) > 1 or None in codes
+    package, mixed = "duagc.pipeline.experiments", _are_mixed(judged)
     content: dict[str, Any] = {
         "sections": sections,
         "mixed": mixed,
@@ -101,6 +116,19 @@ def write_report(out: Path, judged: Sequence[JudgedExperiment]) -> None:
     _write(out / MARKDOWN, filled(package, "page.md.j2", escaped=False, **content))
     _write(out / VERDICTS, verdicts_text)
     write_costs(out, [one.experiment.name for one in judged])
+
+
+def _are_mixed(judged: Sequence[JudgedExperiment]) -> bool:
+    """Whether sections are not known to be of one code; those with a steered robot have a digest of their own."""
+    for steered in (False, True):
+        codes = {
+            one.result.get("code_sha256")
+            for one in judged
+            if is_steered(one.experiment, one.experiment.profile(one.result["profile"])) == steered
+        }
+        if len(codes) > 1 or None in codes:
+            return True
+    return False
 
 
 def _uses(judged: Sequence[JudgedExperiment]) -> list[dict[str, Any]]:

@@ -22,6 +22,7 @@ from duagc.pipeline.base.files import read_bytes
 from duagc.pipeline.config.base import Config, load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.experiments.metric_names import check_metric
+from duagc.pipeline.experiments.statistics import MOST_EXACT
 
 RULES = Path(__file__).parent / "rules"
 Kind = Literal["better", "no_worse", "equivalent", "differs"]
@@ -260,6 +261,10 @@ def _check(path: Path, file: ExperimentFile) -> None:
         where = f"{path}: profile {name}"
         if not profile.seeds:
             raise DuagError(f"{where}: found no seed, expected at least one")
+        if len(profile.seeds) > MOST_EXACT:
+            raise DuagError(
+                f"{where}: found {len(profile.seeds)} seeds, expected at most {MOST_EXACT}, for the exact test"
+            )
         for configuration in file.configurations:
             try:
                 data = data_of(file, profile, configuration)

@@ -52,10 +52,12 @@ class PairedGaps:
     Attributes:
         gaps: by seed, positive where the first side is better; of a ratio, logarithms.
         missing: why there is none, by seed.
+        against: seeds of these in which only the first side has no value; of a claim that both are alike, only one.
     """
 
     gaps: Mapping[int, float]
     missing: Mapping[int, str]
+    against: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class RuleVerdict:
         word: the verdict.
         why: the reason, for people.
         gaps: paired differences by seed, positive where the first side is better.
+        against: seeds without one that speak against the rule.
         mean: of them; NaN if there are too few.
         low: lower end of the bootstrap interval of the mean.
         high: upper end.
@@ -78,6 +81,7 @@ class RuleVerdict:
     word: Word
     why: str
     gaps: Mapping[int, float]
+    against: frozenset[int] = frozenset()
     mean: float = math.nan
     low: float = math.nan
     high: float = math.nan
@@ -100,7 +104,7 @@ def compare(rule: Rule, file: ExperimentFile, rows: Sequence[ResultRow], recordi
         recording: name of it; empty for the simulated ones.
     """
     at = {(row.configuration, row.seed): row for row in rows if row.recording == recording}
-    gaps, missing = dict[int, float](), dict[int, str]()
+    gaps, missing, against = dict[int, float](), dict[int, str](), set[int]()
     sign = 1.0 if file.metrics[rule.metric].better == "more" else -1.0
     for seed in sorted({seed for _, seed in at}):
         pair = [
@@ -110,6 +114,9 @@ def compare(rule: Rule, file: ExperimentFile, rows: Sequence[ResultRow], recordi
         absent = [value for value in pair if isinstance(value, str)]
         if absent:
             missing[seed] = absent[0]
+            one_way = rule.kind in ("better", "no_worse")  # a rival without a value speaks for the claim
+            if len(absent) == 1 and (isinstance(pair[0], str) or not one_way):
+                against.add(seed)
             continue
         first, second = (float(value) for value in pair)
         if not rule.ratio:
@@ -118,7 +125,9 @@ def compare(rule: Rule, file: ExperimentFile, rows: Sequence[ResultRow], recordi
             gaps[seed] = sign * math.log(first / second)
         else:
             missing[seed] = f"{rule.metric} is {min(first, second):g}, of which there is no ratio"
-    return PairedGaps(gaps, missing)
+            if rule.kind not in ("better", "no_worse") or sign * first < sign * second:
+                against.add(seed)
+    return PairedGaps(gaps, missing, frozenset(against))
 
 
 def _value(row: ResultRow | None, side: RuleSide) -> float | str:
@@ -134,7 +143,8 @@ def judge(name: str, file: ExperimentFile, rows: Sequence[ResultRow]) -> list[Ru
     """Verdicts of all rules on the simulated recordings.
 
     A rule holds if the paired t test says so after Holm's adjustment, and the exact sign-flip test, which needs no
-    normal differences, says so too.
+    normal differences, says so too; and if no seed is left out because the first side alone has no value, as of a
+    session that does not end.
 
     Args:
         name: of the experiment.
@@ -162,11 +172,20 @@ def _tested(name: str, rule: Rule, file: ExperimentFile, found: PairedGaps) -> R
     if len(gaps) < 2 or least > file.level:
         pairs = "1 pair" if len(gaps) == 1 else f"{len(gaps)} pairs"
         why = f"{pairs}, of which the exact test cannot reach {file.level:g}{lost}"
-        return RuleVerdict(rule, "not testable here", why, found.gaps)
+        return RuleVerdict(rule, "not testable here", why, found.gaps, found.against)
     p, p_exact = _p_values(rule, gaps)
     low, high = bca_interval(gaps, generator(0, "experiment", experiment=name, rule=rule.name))
     return RuleVerdict(
-        rule, "fails", lost, found.gaps, mean=mean(gaps), low=low, high=high, p=p, p_exact=p_exact
+        rule,
+        "fails",
+        lost,
+        found.gaps,
+        found.against,
+        mean=mean(gaps),
+        low=low,
+        high=high,
+        p=p,
+        p_exact=p_exact,
     )
 
 
@@ -195,6 +214,8 @@ def _p_values(rule: Rule, gaps: list[float]) -> tuple[float, float]:
 def _decided(verdict: RuleVerdict, level: float) -> RuleVerdict:
     lost = verdict.why
     if verdict.p <= level and verdict.p_exact <= level:
+        if verdict.against:
+            return replace(verdict, why=f"shown by {len(verdict.gaps)} seeds, and not by all{lost}")
         return replace(verdict, word="holds", why=f"both tests reject the contrary{lost}")
     return replace(verdict, why=f"{_contrary(verdict, level)}{lost}")
 

@@ -181,7 +181,8 @@ def test_the_result_keeps_values_reasons_and_the_rule(place: Path) -> None:
 
 def test_the_page_says_the_verdict_and_repeats_to_the_last_byte(place: Path) -> None:
     judged = judge_folder(place / "out", place / "rules")
-    assert [(v.word, len(v.gaps)) for v in judged[0].verdicts] == [("holds", 5)]
+    assert [(v.word, len(v.gaps)) for v in judged[0].verdicts] == [("fails", 5)]
+    assert judged[0].verdicts[0].why.startswith("shown by 5 seeds, and not by all; seeds 5: ")
     files = [PAGE, MARKDOWN, VERDICTS, "mine/rules.svg"]
     write_report(place / "out", judged)
     before = [(place / "out" / file).read_bytes() for file in files]

@@ -159,3 +159,22 @@ def test_nothing_is_rarely_called_better() -> None:
         a, b = (list(stream.normal(1.0, 0.1, 5)) for _ in range(2))
         held += any(v.word == "holds" for v in judge("test", file_of(*[{"kind": "better"}] * 4), rows(a, b)))
     assert held <= 4
+
+
+def test_seeds_that_the_first_side_does_not_reach_are_not_left_out() -> None:
+    """Ten seeds, in five of which only the first side has no value: the others show nothing of it."""
+    base = [*BASE, *[x + 0.01 for x in BASE]]
+    better = [x - 0.3 for x in base]
+    kinds = ({"kind": "better"}, {"kind": "no_worse", "margin": 0.01})
+    for changed in kinds:
+        assert one(changed, [*better], [*base]).word == "holds"
+        verdict = one(changed, [None, *better[1:]], [*base])
+        assert verdict.word == "fails"
+        assert verdict.why.startswith("shown by 9 seeds, and not by all; seeds 0: ")
+        assert one(changed, [*better], [None, *base[1:]]).word == "holds", "a rival that does not end loses"
+    alike = {"kind": "equivalent", "margin": 0.02}
+    near = [x + 0.001 * (k % 3 - 1) for k, x in enumerate(base)]
+    assert one(alike, [*near], [*base]).word == "holds"
+    assert one(alike, [*near], [None, *base[1:]]).word == "fails"
+    nothing = one({"kind": "better", "ratio": True, "margin": 0.1}, [*better], [0.0, *base[1:]])
+    assert nothing.word == "fails", "less is better, and nothing is less than nothing"
