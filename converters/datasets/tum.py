@@ -80,17 +80,17 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
 
 
 def _camera(src: Path, settings: Options, image: Path) -> tuple[PinholeCamera, tuple[float, ...], str]:
-    """Camera, distortion and name of the sensor: by the options, the name of the folder, or its calibration.txt."""
+    """Camera, distortion and name of the sensor: by the options, its calibration.txt, or the name of the folder."""
     match = re.search(r"freiburg[123]|fr[123]", src.resolve().name)
     stated = src / "calibration.txt"
     if settings.intrinsics:
         return *_stated(settings.intrinsics, "intrinsics", image), "depth camera"
     if settings.camera != "auto":
         return *CAMERAS[settings.camera], KINECT
-    if match:
-        return *CAMERAS[f"freiburg{match[0][-1]}"], KINECT
     if stated.is_file():
         return *_stated(read_text(stated, "fx fy cx cy"), str(stated), image), "depth camera"
+    if match:
+        return *CAMERAS[f"freiburg{match[0][-1]}"], KINECT
     raise DuagError(
         f"{src}: its name holds none of {', '.join(CAMERAS)}, and it has no calibration.txt; expected "
         "--set intrinsics='fx fy cx cy', or camera=NAME with one of these"

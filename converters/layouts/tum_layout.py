@@ -97,6 +97,9 @@ def associate(
     """Pairs of color and depth, in order of the color's time."""
     limit = options.limit_ns
     times = [d.stamp_ns for d in depth]
+    if options.association != "official":
+        near = [(c, depth[j]) for c in color if (j := _nearest(times, c.stamp_ns)) is not None]
+        return [(c, d) for c, d in near if abs(d.stamp_ns - c.stamp_ns) <= limit]
     candidates = []
     for i, c in enumerate(color):
         first, last = bisect_left(times, c.stamp_ns - limit), bisect_left(times, c.stamp_ns + limit + 1)
@@ -106,12 +109,34 @@ def associate(
     taken_depth: set[int] = set()
     pairs = []
     for _, i, j in candidates:
-        if i in taken_color or (options.association == "official" and j in taken_depth):
+        if i in taken_color or j in taken_depth:
             continue
         taken_color.add(i)
         taken_depth.add(j)
         pairs.append((i, j))
     return [(color[i], depth[j]) for i, j in sorted(pairs)]
+
+
+def _nearest(times: list[int], stamp_ns: int) -> int | None:
+    """Place of the nearest of sorted times, of two the earlier; None if there is none."""
+    after = bisect_left(times, stamp_ns)
+    around = [j for j in (after - 1, after) if 0 <= j < len(times)]
+    return min(around, key=lambda j: (abs(times[j] - stamp_ns), j), default=None)
+
+
+def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
+    """The least difference between sorted times and sorted others, seconds.
+
+    Args:
+        times_ns: sorted.
+        others_ns: sorted.
+    """
+    times, others = np.array(times_ns, dtype=np.int64), np.array(others_ns, dtype=np.int64)
+    after = np.searchsorted(others, times)
+    near = np.stack(
+        [others[np.clip(after, 0, len(others) - 1)], others[np.clip(after - 1, 0, len(others) - 1)]]
+    )
+    return float(np.abs(near - times).min()) / NANOSECONDS
 
 
 def _is_near(color: Listed, depth: Listed) -> bool:

@@ -284,6 +284,12 @@ def test_other_cameras_in_the_layout_of_tum(made: dict[str, tuple[Path, Path]], 
         np.testing.assert_array_equal(stated.frame(1).depth, log.frame(1).depth)
         np.testing.assert_array_equal(stated.frame(1).color, log.frame(1).color)
         assert filed.camera == PinholeCamera(640, 480, 530.0, 531.0, 320.5, 239.5)
+    named = tmp_path / "kitchen_fr1"  # as a first Kinect's recordings are, by chance
+    shutil.copytree(other, named)
+    registry.convert("tum", named, tmp_path / "named")
+    with open_rgbd(tmp_path / "named" / "alpha.mcap") as log:
+        assert log.camera == PinholeCamera(640, 480, 530.0, 531.0, 320.5, 239.5)
+        assert log.readout == Readout()
     for text in ("530 531 320", "530 531 320 x", "0 531 320 240"):
         with pytest.raises(DuagError, match="intrinsics"):
             registry.convert("tum", other, tmp_path / "bad", options=[f"intrinsics={text}"])
