@@ -116,22 +116,22 @@ class RobotWriter:
         """Write another mask of all images, at the end, where a region was found that does not show the scene."""
         if self._regions is None or not self._stamps:
             return
-        found = self._regions.result(self._valid)
-        for name, shown in found.items():
+        for name, shown in (found := self._regions.result(self._valid)).items():
             self._shares[name] = float(np.mean(~shown))
             self._valid = shown if self._valid is None else self._valid & shown
         if found:
             self._write_valid(self._stamps[-1])
 
     def _write_valid(self, stamp_ns: int) -> None:
-        """Write the mask of all images where it leaves pixels out."""
+        """Write the mask of all images where it leaves pixels out; readings may come after the last of them."""
         if self._valid is None or self._valid.all():
             self._valid = None
             return
         if not self._valid.any():
             raise DuagError(f"robot {self.name}: the masks leave no pixel, expected some that show the scene")
         message = messages.pack_valid(stamp_ns, self.name, self._valid)
-        self._log.write(topics.VALID.of(self.name), message, stamp_ns)
+        last_ns = max(stamp_ns, self._log.last_log_time_ns)
+        self._log.write(topics.VALID.of(self.name), message, last_ns, stamp_ns)
 
     def add_frame(
         self,

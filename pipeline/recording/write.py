@@ -122,6 +122,11 @@ class LogWriter:
         publish_time_ns = log_time_ns if publish_time_ns is None else int(publish_time_ns)
         self._append(topic, proto.SerializeToString(deterministic=True), log_time_ns, publish_time_ns)
 
+    @property
+    def last_log_time_ns(self) -> int:
+        """Time of the last message; the next one is not earlier."""
+        return self._last_log_time_ns
+
     def copy(self, log: LogFile, record: Record) -> None:
         """Append a message of another log as it stands there, also of a topic that is not in the table.
 

@@ -194,3 +194,28 @@ def test_sensors_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="an image is"):
             robot.add_depth(0, np.zeros((4, 4), np.uint16))
         robot.add_frame(7, b"", "png", np.zeros((180, 240), np.uint16))
+
+
+def test_readings_may_come_after_the_last_frame_of_a_robot_that_sees_itself(tmp_path: Path) -> None:
+    """The mask of its own body is written when all images were seen."""
+
+    class Body:
+        def add(self, *_: object) -> None:
+            pass
+
+        def result(self, _: object) -> dict[str, np.ndarray]:
+            shown = np.ones((CAMERA.height, CAMERA.width), dtype=bool)
+            shown[100:] = False
+            return {"body": shown}
+
+    def fill(robot: RobotWriter) -> None:
+        robot.set_imu(np.eye(4))
+        robot._regions = Body()
+        color, depth = render(CAMERA, path(1)[0])
+        robot.add_frame(20_000_000, picture(color), "png", np.rint(depth / 0.0005).astype(np.uint16))
+        robot.add_imu(90_000_000, np.zeros(3), np.array([0, 9.8, 0]))
+
+    with open_rgbd(record(tmp_path / "rec", fill)) as log:
+        assert log.valid is not None
+        assert not log.valid[100:].any()
+        assert log.frame(0).stamp_ns == 20_000_000
