@@ -135,6 +135,9 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
 
     if hasattr(message, "format"):
         data = bytes(message.data)
+        pattern = message.format.split(";")[0].strip()
+        if pattern.startswith("bayer_"):
+            return _bayer_as_png(data, pattern, where), "png"
         if data.startswith(b"\xff\xd8\xff"):
             return data, "jpeg"
         if data.startswith(b"\x89PNG"):
@@ -149,6 +152,10 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
         raise DuagError(f"{where}: encoding {message.encoding!r}, expected one of {known}")
     channels, conversion = _COLOR_CODES[message.encoding]
     pixels = rows_of(message, where, "uint8", channels)
+    if channels == 2 and message.width % 2:
+        raise DuagError(
+            f"{where}: {message.encoding} is {message.width} pixels wide, expected an even number"
+        )
     if conversion is not None:
         pixels = cv2.cvtColor(pixels, getattr(cv2, conversion))
     settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
@@ -157,6 +164,22 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
 
 def _is_webp(data: bytes) -> bool:
     return data.startswith(b"RIFF") and data[8:12] == b"WEBP"
+
+
+def _bayer_as_png(data: bytes, pattern: str, where: str) -> bytes:
+    """The colors of a compressed mosaic, as PNG; one that is compressed in color is none any more."""
+    import cv2
+
+    image = decode_image(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or image.dtype != np.uint8:
+        found = "no image" if image is None else str(image.dtype)
+        raise DuagError(f"{where}: {found} of {pattern}, expected a JPEG or PNG of 8 bits")
+    if image.ndim == 2:
+        if pattern not in _COLOR_CODES:
+            known = ", ".join(name for name in _COLOR_CODES if name.startswith("bayer_"))
+            raise DuagError(f"{where}: compressed {pattern}, expected one of {known}")
+        image = cv2.cvtColor(image, getattr(cv2, str(_COLOR_CODES[pattern][1])))
+    return cv2.imencode(".png", image[..., :3], [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
 
 
 def _webp_as_png(data: bytes, where: str) -> bytes:
@@ -330,19 +353,26 @@ class RosCamera:
             )
         return RosCamera(camera, tuple(D.tolist()), fisheye, message.header.frame_id)
 
-    def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Where in its images every pixel of the pinhole lies; None without distortion."""
+    def maps(
+        self, onto: PinholeCamera | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in its images every pixel of a pinhole at the same place lies; None without distortion.
+
+        Args:
+            onto: the pinhole; None: its own.
+        """
         import cv2
 
         if not self.distortion:
             return None
         c = self.camera
         K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-        rays, zero = c.rays().reshape(-1, 1, 3), np.zeros(3)
+        onto = onto or c
+        rays, zero = onto.rays().reshape(-1, 1, 3), np.zeros(3)
         project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
         if self.fisheye:
             pixels, _ = project(rays, zero, zero, K, np.array(self.distortion[:4]))
         else:
             pixels, _ = project(rays, zero, zero, K, np.array(self.distortion))
-        u, v = pixels.reshape(c.height, c.width, 2).astype(np.float32).transpose(2, 0, 1)
+        u, v = pixels.reshape(onto.height, onto.width, 2).astype(np.float32).transpose(2, 0, 1)
         return np.ascontiguousarray(u), np.ascontiguousarray(v)

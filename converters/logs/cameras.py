@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from duagc.converters.layouts.ros_images import RosCamera, size_of
 from duagc.converters.logs.entries import Entry
+from duagc.converters.logs.files import Log
+from duagc.converters.logs.frames import pose_matrix
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.robot_writer import check_camera
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
+RECTIFIED = ("image_rect", "image_rect_color", "rect")
 SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
 
 
@@ -88,3 +94,32 @@ class CameraWatch:
                 f"{where} changes at {entry.log_ns} ns from fx fy cx cy = {a.round(2).tolist()} px to "
                 f"{b.round(2).tolist()}, expected one camera (a zoom or autofocus has to be fixed while recording)"
             )
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether images are undistorted, by the name of their topic.
+
+    Args:
+        topic: of the images.
+    """
+    name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
+    return name.startswith(RECTIFIED)
+
+
+def realsense_extrinsics(log: Log, color: str, depth: str, name: str) -> Array | None:
+    """T_color_depth [4, 4] of a recording by RealSense's own software: each stream states T_stream_reference.
+
+    Args:
+        log: the log.
+        color: topic of the images.
+        depth: topic of the depth images.
+        name: of the log, for errors.
+    """
+    found = []
+    for image in (color, depth):
+        topic = f"{image.removesuffix('/image/data')}/tf/0"
+        if not log.of_type("geometry_msgs/msg/Transform", below=topic.removesuffix("/0")):
+            return None
+        m = log.first(topic)
+        found.append(pose_matrix(m.translation, m.rotation, f"{name}: {topic}"))
+    return found[0] @ se3.inverse(found[1])

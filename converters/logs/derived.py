@@ -160,21 +160,26 @@ def stereo_of(
     if settings.T_color_depth:
         T_right_left = se3.inverse(extrinsics_of("T_color_depth", settings.T_color_depth))
         return Stereo(StereoRig.of(raw[0], raw[1], T_right_left, where, options=settings), size, where)
-    infos = [log.first(topic) for topic in (color[1], right[1])]
+    infos = [log.first(topic) for topic in (color[1], right[1]) if topic]
     R, P = (
         [np.array(getattr(m, name if hasattr(m, name) else name.lower()), dtype=np.float64) for m in infos]
         for name in ("R", "P")
     )
-    if P[1][3] != 0:
+    if len(P) == 2 and all(p.size == 12 for p in P) and P[1][3] != 0:
         if rectified:
             return Stereo(
                 StereoRig.rectified(cameras[0], cameras[1], -P[1][3] / P[1][0], where, options=settings),
                 size,
                 where,
             )
-        rig = StereoRig.projected(
-            raw[0], raw[1], R, [p.reshape(3, 4) for p in P], where=where, options=settings
-        )
+        for topic, turn in zip((color[1], right[1]), R, strict=True):
+            if turn.size != 9:
+                raise DuagError(f"{log.name}: {topic}: R of {turn.size} numbers, expected 9")
+        projections = [
+            _projection(RosCamera.of(info, True, f"{log.name}: {topic}").camera, p)
+            for info, topic, p in zip(infos, (color[1], right[1]), P, strict=True)
+        ]
+        rig = StereoRig.projected(raw[0], raw[1], R, projections, where=where, options=settings)
         return Stereo(rig, size, where)
     T_left_right = transforms.lookup(color[2].frame_id, right[2].frame_id)
     if T_left_right is None:
@@ -184,6 +189,14 @@ def stereo_of(
         )
     rig = StereoRig.of(raw[0], raw[1], se3.inverse(T_left_right), where, options=settings)
     return Stereo(rig, size, where)
+
+
+def _projection(camera: PinholeCamera, P: Array) -> Array:
+    """P [3, 4] of the images, which may be a part of those of the sensor, or have fewer pixels."""
+    found = np.array(P, dtype=np.float64).reshape(3, 4)
+    found[0, 3] *= camera.fx / found[0, 0]
+    found[0, 0], found[1, 1], found[0, 2], found[1, 2] = camera.fx, camera.fy, camera.cx, camera.cy
+    return found
 
 
 def sweeps_of(

@@ -181,6 +181,10 @@ class MotionReader:
         text = getattr(self._settings, setting)
         if text:
             return extrinsics_of(setting, text)
+        if option == "odometry" and not frame_in_log:
+            raise DuagError(
+                f"{self.name}: messages of odometry name no body frame, expected --set {setting}='x y z qw qx qy qz'"
+            )
         frame = frame_name(
             (self._settings.truth_frame if option == "truth" else "") or frame_in_log or self.color_frame
         )

@@ -6,35 +6,39 @@ import math
 from array import array
 from collections.abc import Callable, Iterator
 from functools import cached_property
-from pathlib import Path, PurePath, PurePosixPath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.ros_images import RosCamera, is_integer_depth, size_of
-from duagc.converters.layouts.tum_layout import Listed, associate
+from duagc.converters.layouts.tum_layout import Listed, associate, nearest_s
 from duagc.converters.layouts.validity import of_maps
-from duagc.converters.logs.cameras import CameraWatch, stated, stated_camera
+from duagc.converters.logs.cameras import (
+    CameraWatch,
+    is_rectified,
+    realsense_extrinsics,
+    stated,
+    stated_camera,
+)
 from duagc.converters.logs.choice import REGISTERED, Chooser, video_words
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
 from duagc.converters.logs.files import Log
-from duagc.converters.logs.frames import Transforms, pose_matrix
+from duagc.converters.logs.frames import Transforms
 from duagc.converters.logs.gather import gathered
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
 from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
-from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.recording.pairing import TOLERANCE_NS
 from duagc.pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
 
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
-RECTIFIED = ("image_rect", "image_rect_color", "rect")
 OUT_SCALE = 0.0005  # meters per unit of depth that was registered or came as floats
 
 
@@ -79,6 +83,8 @@ class RobotLog:
         self.depth_camera = self._camera(self.depth, "depth_info", chooser)
         self.T_color_depth = self._extrinsics()
         sensor = self.depth_camera.camera
+        if self._is_depth_rectified:
+            self.camera = sensor
         steps = sample_steps(sensor, self.camera)
         if self.T_color_depth is not None and steps**2 * sensor.width * sensor.height > MOST_SAMPLES:
             finer = max(self.camera.fx / sensor.fx, self.camera.fy / sensor.fy)
@@ -93,12 +99,12 @@ class RobotLog:
     def _derived(self, chooser: Chooser) -> Derived:
         """Depth of a stereo pair or of a LiDAR."""
         s = self.settings
-        color = self.color, self._info(self.color, "color_info", chooser), self.color_camera
         if s.depth_from == "stereo":
-            right = self._info(self.depth, "depth_info", chooser)
+            color = self.color, self._info_unless_stated("color_info", chooser), self.color_camera
+            right = self._info_unless_stated("depth_info", chooser)
             other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
             return stereo_of(
-                self.log, color, other, _is_rectified(self.color), transforms=self.transforms, settings=s
+                self.log, color, other, is_rectified(self.color), transforms=self.transforms, settings=s
             )
         if s.max_difference_s == 0:
             self.settings = s.model_copy(update={"max_difference_s": HALF_TURN_S})
@@ -135,13 +141,19 @@ class RobotLog:
         """The CameraInfo of an image topic."""
         return chooser.info(option, topic).required(self.log, option)
 
+    def _info_unless_stated(self, option: str, chooser: Chooser) -> str:
+        """The CameraInfo of the color or the depth topic; empty where the options state the camera."""
+        if stated(self.settings, option, bool(chooser.infos)):
+            return ""
+        return self._info(self.color if option == "color_info" else self.depth, option, chooser)
+
     def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
         """Camera of an image topic: as the options state it, else by its CameraInfo."""
         if text := stated(self.settings, option, bool(chooser.infos)):
             return stated_camera(text, chooser.images[topic], f"{self.name}: {topic}")
         chosen = self._info(topic, option, chooser)
-        camera = RosCamera.of(self.log.first(chosen), _is_rectified(topic), f"{self.name}: {chosen}")
-        self._cameras[chosen] = (camera, _is_rectified(topic))
+        camera = RosCamera.of(self.log.first(chosen), is_rectified(topic), f"{self.name}: {chosen}")
+        self._cameras[chosen] = (camera, is_rectified(topic))
         found = size_of(chooser.images[topic], f"{self.name}: {topic}")
         expected = camera.camera.width, camera.camera.height
         if found != expected:
@@ -153,7 +165,14 @@ class RobotLog:
     @cached_property
     def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Where in the color images every pixel of the recording's camera lies."""
-        return self.color_camera.maps() if self.settings.undistort else None
+        onto = self.camera if self._is_depth_rectified else None
+        return self.color_camera.maps(onto) if self.settings.undistort else None
+
+    @cached_property
+    def _is_depth_rectified(self) -> bool:
+        """Whether depth is registered to color as it looks without distortion, while color is recorded with it."""
+        registered = self.derived is None and self.T_color_depth is None and self.settings.undistort
+        return registered and is_rectified(self.depth) and bool(self.color_camera.distortion)
 
     @cached_property
     def valid(self) -> Mask | None:
@@ -167,8 +186,10 @@ class RobotLog:
     def depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Where in the depth images every pixel of their pinhole lies; None if they need not be undistorted.
 
-        Depth that is registered has the distortion of color; that of another camera its own.
+        Depth that is registered has the distortion of color, unless it is rectified; that of another camera its own.
         """
+        if self._is_depth_rectified:
+            return None
         return self.color_maps if self.T_color_depth is None else self.depth_camera.maps()
 
     # --- where the cameras are
@@ -191,7 +212,7 @@ class RobotLog:
         T = (
             self.transforms.lookup(color.frame_id, depth.frame_id)
             if named_frames
-            else self._realsense_extrinsics()
+            else realsense_extrinsics(self.log, self.color, self.depth, self.name)
         )
         if T is None:
             raise DuagError(
@@ -200,17 +221,6 @@ class RobotLog:
                 "'x y z qw qx qy qz' or registered=yes"
             )
         return T
-
-    def _realsense_extrinsics(self) -> Array | None:
-        """T_color_depth [4, 4] of a recording by RealSense's own software: each stream states T_stream_reference."""
-        found = []
-        for image in (self.color, self.depth):
-            topic = f"{image.removesuffix('/image/data')}/tf/0"
-            if not self.log.of_type("geometry_msgs/msg/Transform", below=topic.removesuffix("/0")):
-                return None
-            m = self.log.first(topic)
-            found.append(pose_matrix(m.translation, m.rotation, f"{self.name}: {topic}"))
-        return found[0] @ se3.inverse(found[1])
 
     @cached_property
     def imu(self) -> Imu | None:
@@ -313,7 +323,11 @@ class RobotLog:
                 raise DuagError(
                     f"{self.name}: {topic}: all times are zero, expected times, or --set time_source=log"
                 )
-        listed = {topic: [Listed(t, Path()) for t in sorted(set(times))] for topic, times in stamps.items()}
+            if unset := times.count(0):
+                self.warnings.append(f"{topic}: {unset} images without a time; left out")
+        listed = {
+            topic: [Listed(t, Path()) for t in sorted(set(times)) if t] for topic, times in stamps.items()
+        }
         settings = self.settings
         if self.derived is not None and settings.association == "all":
             # eyes and sweeps are of one time with the color; none of them can be moved or used twice
@@ -380,19 +394,3 @@ class RobotLog:
         moved = "registered to color by the converter" if self.T_color_depth is not None else "registered"
         moved = self.derived.words if self.derived else moved
         return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
-
-
-def _is_rectified(topic: str) -> bool:
-    """Whether images are undistorted, by the name of their topic."""
-    name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
-    return name.startswith(RECTIFIED)
-
-
-def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
-    """The least difference between sorted times and sorted others, seconds."""
-    times, others = np.array(times_ns, dtype=np.int64), np.array(others_ns, dtype=np.int64)
-    after = np.searchsorted(others, times)
-    near = np.stack(
-        [others[np.clip(after, 0, len(others) - 1)], others[np.clip(after - 1, 0, len(others) - 1)]]
-    )
-    return float(np.abs(near - times).min()) / NANOSECONDS

@@ -233,3 +233,18 @@ def test_robots_whose_frames_have_the_same_names(tmp_path: Path) -> None:
     own = [("/camera/tf_static", START_NS, static), ("/tf_static", START_NS, other), *rows]
     bag = r.write(tmp_path / "own", own, "plain")
     registry.convert("ros", bag, tmp_path / "rec", options=["namespaces=/camera"])
+
+
+def test_poses_of_nobody_knows_which_body_are_no_odometry(tmp_path: Path) -> None:
+    """The base of a robot looks along x, its camera along z."""
+    r, rows = Ros(2), scene(Ros(2))
+    for topic, _, message in rows:
+        if topic == "/odom":
+            object.__setattr__(message, "child_frame_id", "")
+    bag = r.write(tmp_path / "bag", rows, "sqlite3")
+    with pytest.raises(
+        DuagError, match="messages of odometry name no body frame, expected --set T_odometry_color="
+    ):
+        registry.convert("ros", bag, tmp_path / "rec", options=["odometry=/odom"])
+    stated = ["odometry=/odom", "T_odometry_color=0 0 0 1 0 0 0"]
+    registry.convert("ros", bag, tmp_path / "rec", options=stated)

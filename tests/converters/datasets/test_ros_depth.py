@@ -12,6 +12,7 @@ import pytest
 from duagc.converters import registry
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.recording.read import LogFile
 from duagc.pipeline.recording.register_depth import register_depth
@@ -19,6 +20,7 @@ from tests.fixtures.box_room import path, render
 from tests.fixtures.ros_bags import (
     COLOR,
     DEPTH,
+    DISTORTION,
     FRAMES,
     START_NS,
     STEP_NS,
@@ -173,3 +175,42 @@ def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
     assert all(
         np.array_equal(m.unpack_depth(record.proto(), "here"), pixels[i]) for i, record in enumerate(records)
     )
+
+
+def test_depth_registered_to_color_without_distortion_has_the_camera_of_that(tmp_path: Path) -> None:
+    """As drivers of OpenNI give it: raw color with K and D, depth of P, whose focal length is another."""
+    r, straight = Ros(1), PinholeCamera(COLOR.width, COLOR.height, 120.0, 121.0, 80.5, 59.0)
+    rows = []
+    for topic, log_ns, message in scene(r):
+        if topic.endswith("camera_info"):
+            message = r.info(START_NS, "_color", COLOR, DISTORTION)
+            message.P = np.array([straight.fx, 0, straight.cx, 0, 0, straight.fy, straight.cy, 0, 0, 0, 1, 0])
+            topic = topic.replace("camera/depth", "camera/depth_registered/hw_registered")
+        elif topic.endswith("image_rect_raw"):
+            k = sum(t.endswith("image_rect") for t, _, _ in rows)
+            raw = np.rint(render(straight, path(FRAMES)[k])[1] * 1000).astype(np.uint16)
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            message = r.image(stamp, "_color", raw, "16UC1")
+            topic = "/camera/depth_registered/hw_registered/image_rect"
+        rows.append((topic, log_ns, message))
+    registry.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        assert log.camera == straight
+        frame = log.frame(1)
+    color, z = render(straight, path(FRAMES)[1])
+    shown = frame.depth > 0  # where the color camera sees something
+    assert shown.mean() > 0.6
+    np.testing.assert_allclose(frame.depth[shown], (np.rint(z * 1000) / 1000)[shown], atol=1e-6)
+    assert np.median(np.abs(frame.color[shown].astype(int) - color[shown])) < 6
+
+
+def test_an_image_without_a_time_is_left_out(tmp_path: Path) -> None:
+    r, rows = Ros(2), scene(Ros(2))
+    first = next(message for topic, _, message in rows if topic.endswith("color/image_raw"))
+    for name in ("sec", "nanosec"):
+        object.__setattr__(first.header.stamp, name, 0)
+    registry.convert("ros", r.write(tmp_path / "bag", rows, "sqlite3"), tmp_path / "rec")
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        assert log.pairing.pairs[0][0] > START_NS
+    warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
+    assert any("/camera/color/image_raw: 1 images without a time; left out" in text for text in warnings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -10,9 +11,13 @@ import numpy as np
 import pytest
 
 from duagc.converters import registry
+from duagc.converters.layouts.ros_images import RosCamera
 from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
+from duagc.converters.logs.derived import stereo_of
+from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, open_rgbd
 from tests.fixtures.lidar_logs import FRAMES, START, lidar_log
 from tests.fixtures.ros_bags import Ros, odometry
@@ -48,7 +53,7 @@ def calibrated(info: Any, R: np.ndarray, P: np.ndarray) -> Any:
 
 
 def stereo_log(folder: Path, stated: str) -> Path:
-    """A bag of a pair. stated: how ("p", "rect", "tf", "option" or "wrong") the right camera's place is."""
+    """A bag of a pair. stated: how ("p", "rect", "tf", "option", "wrong", "none") the right camera's place is."""
     r = Ros(2)
     D = [(*D_LEFT, 0.0), (*D_RIGHT, 0.0)]
     size = (LEFT.width, LEFT.height)
@@ -66,6 +71,7 @@ def stereo_log(folder: Path, stated: str) -> Path:
     rows = [
         (f"/eyes/{side}/camera_info", START_NS, info)
         for side, info in zip(("left", "right"), infos, strict=True)
+        if stated != "none"
     ]
     if stated == "tf":
         rows.append(("/tf_static", START_NS, r.tf(r.transform(START_NS, "l", "r", T_LEFT_RIGHT))))
@@ -115,6 +121,68 @@ def test_a_pair_whose_rows_do_not_meet_is_refused(tmp_path: Path) -> None:
         DuagError, match=r"P of /eyes/right/camera_info has no base line, and /tf_static does not tie"
     ):
         registry.convert("ros", log, tmp_path / "rec", options=["depth_from=stereo"])
+
+
+def test_cameras_that_the_options_state_need_no_topic(tmp_path: Path) -> None:
+    def text(camera: PinholeCamera) -> str:
+        return f"{camera.fx!r} {camera.fy!r} {camera.cx!r} {camera.cy!r}"
+
+    log = stereo_log(tmp_path, "none")
+    options = ["depth_from=stereo", "min_depth_m=1.5", f"T_color_depth={TEXT}"]
+    for option, camera, D in (("color_camera", LEFT, D_LEFT), ("depth_camera", RIGHT, D_RIGHT)):
+        options.append(f"{option}={text(camera)} {' '.join(map(repr, D))} 0.0")
+    registry.convert("ros", log, tmp_path / "rec", options=options)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as found:
+        np.testing.assert_allclose(found.camera.matrix(), raw_rig().camera.matrix(), rtol=1e-6)
+    lidar = lidar_log(tmp_path, infos=False)
+    stated = ["depth_from=lidar", f"color_camera={text(PinholeCamera(240, 180, 200.0, 200.0, 119.5, 89.5))}"]
+    registry.convert("ros", lidar, tmp_path / "rec2", options=stated)
+    with open_rgbd(tmp_path / "rec2" / "alpha.mcap") as found:
+        assert found.camera.fx == 200.0
+
+
+def pair_of(infos: list[Any]) -> StereoRig:
+    """The pair of two CameraInfo, whose poses are also on /tf_static."""
+    log = SimpleNamespace(name="log", first=lambda topic: infos["lr".index(topic[-1])])
+    eyes = [(f"/{k}", f"/info/{k}", RosCamera.of(i, False, k)) for k, i in zip("lr", infos, strict=True)]
+    transforms = SimpleNamespace(lookup=lambda *_: T_LEFT_RIGHT)
+    return stereo_of(log, eyes[0], eyes[1], False, transforms=transforms, settings=LogOptions())._frames.rig
+
+
+def infos_of_pair() -> list[Any]:
+    D = [(*D_LEFT, 0.0), (*D_RIGHT, 0.0)]
+    turns = cv2.stereoRectify(
+        LEFT.matrix(), np.array(D[0]), RIGHT.matrix(), np.array(D[1]), (LEFT.width, LEFT.height),
+        T_RIGHT_LEFT[:3, :3], T_RIGHT_LEFT[:3, 3:], flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
+    )  # fmt: skip
+    infos = [Ros(2).info(START_NS, k, c, d) for k, c, d in (("l", LEFT, D[0]), ("r", RIGHT, D[1]))]
+    return [calibrated(infos[k], turns[k], turns[2 + k]) for k in (0, 1)]
+
+
+def test_an_empty_projection_says_nothing_of_the_pair() -> None:
+    infos = infos_of_pair()
+    for info in infos:
+        info.p = np.zeros(0)
+    base = float(np.linalg.norm(T_LEFT_RIGHT[:3, 3]))
+    assert pair_of(infos).baseline_m == pytest.approx(base, rel=1e-6)
+    infos = infos_of_pair()
+    infos[1].r = np.zeros(0)
+    with pytest.raises(DuagError, match="log: /info/r: R of 0 numbers, expected 9"):
+        pair_of(infos)
+
+
+def test_images_with_half_of_the_pixels_have_half_of_the_projection() -> None:
+    whole = pair_of(infos_of_pair())
+    infos = infos_of_pair()
+    for info in infos:
+        info.binning_x = info.binning_y = 2
+    half = pair_of(infos)
+    assert (half.camera.width, half.camera.fx) == (
+        whole.camera.width // 2,
+        pytest.approx(whole.camera.fx / 2),
+    )
+    assert half.camera.cx == pytest.approx((whole.camera.cx + 0.5) / 2 - 0.5)
+    assert half.baseline_m == pytest.approx(whole.baseline_m)
 
 
 def test_a_lidar_and_what_turns_it(tmp_path: Path) -> None:

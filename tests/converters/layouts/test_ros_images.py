@@ -13,6 +13,7 @@ import pytest
 from duagc.converters.layouts import ros_images
 from duagc.converters.logs.foxglove import Fields
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.fixtures.ros_bags import COLOR, Ros
 from tests.fixtures.rvl_images import rvl
 
@@ -202,3 +203,54 @@ def test_the_orientation_in_a_jpeg_turns_no_image() -> None:
     assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (40, 30, 3)
     message = Ros(2).compressed(0, "camera", turned, "jpeg")
     assert ros_images.size_of(message, "here") == (40, 30)
+
+
+@pytest.mark.parametrize("pattern", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+@pytest.mark.parametrize("kind", ["png", "jpeg"])
+def test_a_compressed_mosaic_has_colors(pattern: str, kind: str) -> None:
+    """A red scene: only the pixels of the filter that is red are bright."""
+    place = {"rggb": (0, 0), "bggr": (1, 1), "gbrg": (1, 0), "grbg": (0, 1)}[pattern[6:10]]
+    mosaic = np.zeros((32, 48), np.uint8)
+    mosaic[place[0] :: 2, place[1] :: 2] = 200
+    data = cv2.imencode(f".{kind}", mosaic, [cv2.IMWRITE_JPEG_QUALITY, 100])[1]
+    message = Fields(format=f"{pattern}; {kind} compressed ", data=data.tobytes())
+    encoded, found = ros_images.color_bytes(message, "here")
+    assert found == "png"
+    blue, green, red = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)[4:-4, 4:-4].mean(
+        axis=(0, 1)
+    )
+    assert red > 190
+    assert max(blue, green) < 10
+
+
+def test_a_compressed_mosaic_that_is_not_known_is_refused() -> None:
+    data = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
+    for pattern, content in (("bayer_rggb16", data), ("bayer_rggb8", b"\xff\xd8\xff")):
+        with pytest.raises(DuagError, match=f"here: .*{pattern}, expected"):
+            ros_images.color_bytes(Fields(format=f"{pattern}; png", data=content), "here")
+
+
+def test_two_pixels_that_share_a_color_are_an_even_number() -> None:
+    message = Ros(2).image(0, "camera", np.zeros((4, 7, 2), np.uint8), "uyvy")
+    with pytest.raises(DuagError, match="here: uyvy is 7 pixels wide, expected an even number"):
+        ros_images.color_bytes(message, "here")
+
+
+def test_color_is_drawn_as_another_camera_at_its_place_sees_it() -> None:
+    """Registered depth may belong to the rectified camera, whose focal length is another."""
+    lens = ros_images.RosCamera.of(
+        Ros(2).info(0, "camera", COLOR, (-0.2, 0.03, 0.001, 0.0, 0.0)), False, "here"
+    )
+    onto = PinholeCamera(
+        COLOR.width, COLOR.height, 0.8 * COLOR.fx, 0.8 * COLOR.fy, COLOR.cx + 2, COLOR.cy - 1
+    )
+    own, other = lens.maps(), lens.maps(onto)
+    assert own is not None
+    assert other is not None
+    assert np.hypot(own[0][60, 80] - 80, own[1][60, 80] - 60) < 1
+    v, u = 40, 100
+    x, y = (u - onto.cx) / onto.fx, (v - onto.cy) / onto.fy
+    seen = own[0], own[1]
+    at = np.array([[COLOR.fx * x + COLOR.cx]], np.float32), np.array([[COLOR.fy * y + COLOR.cy]], np.float32)
+    wanted = [cv2.remap(image, *at, cv2.INTER_LINEAR)[0, 0] for image in seen]
+    assert [image[v, u] for image in other] == pytest.approx(wanted, abs=0.05)
