@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
@@ -101,6 +101,13 @@ class PoseConsensusConfig(Config):
     """The same for rotations (rad)."""
     closures: LoopClosureConfig = LoopClosureConfig()
     """Noise and consistency of loop closures."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> PoseConsensusConfig:
+        first, last = self.robust_mu
+        if not 0 < first <= last:
+            raise ValueError(f"consensus.robust_mu is [{first:g}, {last:g}], expected 0 < first <= last")
+        return self
 
     def team_schedule(self) -> TeamSchedule:
         """What is added to the schedule of robust weights."""

@@ -216,6 +216,8 @@ class Agent:
         """A message of the solver. One of a start that is still to come here waits for it."""
         revoked, rest = state_wire.read_labeled(payload, len(self.team))
         if self.poses is not None and revoked == self.alignment.revoked:
+            if n.index not in self.links:
+                raise MalformedError("solver: from a neighbor that is not joined")
             self.poses.take_message(n.index, rest)
         elif revoked & self.alignment.revoked == self.alignment.revoked:
             if len(n.early) >= MAX_EARLY_MESSAGES:

@@ -9,11 +9,14 @@ solvers does, and every robot waits for it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import compress
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.exchange.solvers import LinkStart, SolverStart
@@ -78,6 +81,13 @@ def solve_for_all(
     }
 
 
+def _expanded(weights: Array, keep: NDArray[np.bool_]) -> Array:
+    """Weights of all from those of the kept ones; the others count zero."""
+    out = np.zeros(len(keep))
+    out[keep] = weights
+    return out
+
+
 class ElectedSolver:
     """One robot's side; everything that it sends is a reliable message."""
 
@@ -91,9 +101,15 @@ class ElectedSolver:
         """
         self.start, self.config, self.team = start, config, team
         self.refused: list[str] = []
-        closures = {link.index: link.closures for link in start.links if link.closures}
-        begun = start.T_world_map @ start.own.T_first_keyframe
-        self._own = GraphPart(begun, start.own.relative_poses, start.own.loops, closures)
+        own, held = start.own, {link.index: link for link in start.links if link.closures}
+        self._keep = {index: np.ones(len(link.closures), bool) for index, link in held.items()}
+        loops, self._keep_loops = own.loops, np.ones(len(own.loops), bool)
+        if not config.robust:
+            self._keep = {index: np.asarray(link.keep, bool) for index, link in held.items()}
+            self._keep_loops = np.asarray(own.keep_loops, bool)
+            loops = loops.select(self._keep_loops)
+        closures = {index: tuple(compress(held[index].closures, keep)) for index, keep in self._keep.items()}
+        self._own = GraphPart(start.T_world_map @ own.T_first_keyframe, own.relative_poses, loops, closures)
         self._index = {link.name: link.index for link in start.links}
         self._parts: dict[int, dict[int, GraphPart]] = {}
         self._outbox: list[tuple[int, bytes]] = []
@@ -113,15 +129,20 @@ class ElectedSolver:
             return
         try:
             self._give(solve_for_all(whole, self.start.index, self.config))
-        except MalformedError as error:
+        except (ValueError, IndexError, DuagError) as error:  # of what the others sent
             self.refused.append(str(error))
 
     def _give(self, answer: dict[int, AnswerPart]) -> None:
         """Keep the own part of the answer, and pass the others on."""
-        mine = answer.pop(self.start.index)
-        if len(mine.T_world_keyframe) != len(self._own.T_world_keyframe):
+        mine, own = answer.pop(self.start.index), self._own
+        weights = {peer: len(w) for peer, w in mine.closure_weights.items()}
+        sizes = len(mine.T_world_keyframe), len(mine.loop_weights), weights
+        closures = {peer: len(c) for peer, c in own.closures.items()}
+        if sizes != (len(own.T_world_keyframe), len(own.loops), closures):
             raise MalformedError("answer: of another graph")
-        self._change = float(np.abs(mine.T_world_keyframe - self._own.T_world_keyframe).max())
+        if not np.isfinite(mine.T_world_keyframe).all():
+            raise MalformedError("answer: not a finite number")
+        self._change = float(np.abs(mine.T_world_keyframe - own.T_world_keyframe).max())
         self._answer = mine
         for child in self.start.tree.children:
             below = {r: part for r, part in answer.items() if r in self._parts[child]}
@@ -140,7 +161,7 @@ class ElectedSolver:
     def take_message(self, sender: int, payload: bytes) -> None:
         try:
             if sender in self.start.tree.children and sender not in self._parts:
-                self._parts[sender] = elected_wire.read_graphs(payload, self.team)
+                self._parts[sender] = self._read_graphs(sender, payload)
             elif sender == self.start.tree.parent and self._sent and self._answer is None:
                 answer = elected_wire.read_answer(payload)
                 if self.start.index not in answer:
@@ -150,6 +171,14 @@ class ElectedSolver:
                 raise MalformedError("elected: not expected from this robot, or came twice")
         except ValueError as error:
             self.refused.append(str(error))
+
+    def _read_graphs(self, child: int, payload: bytes) -> dict[int, GraphPart]:
+        """The graphs of a child's subtree: of robots below this one that no other child sent."""
+        parts = elected_wire.read_graphs(payload, self.team)
+        known = {self.start.index}.union(*self._parts.values())
+        if child not in parts or any(r in known or not self.start.tree.subtree >> r & 1 for r in parts):
+            raise MalformedError("graphs: lacks its sender, or has a robot that is not below it")
+        return parts
 
     @property
     def converged(self) -> bool:
@@ -166,21 +195,22 @@ class ElectedSolver:
 
     def weights(self, peer: str) -> Array:
         index = self._index[peer]
-        if self._answer is None:
-            return np.ones(len(self._own.closures.get(index, ())))
-        return self._answer.closure_weights.get(index, np.zeros(0)).copy()
+        keep = self._keep.get(index, np.zeros(0, bool))
+        if self._answer is None or not len(keep):
+            return keep.astype(np.float64)
+        return _expanded(self._answer.closure_weights[index], keep)
 
     @property
     def loop_weights(self) -> Array:
         if self._answer is None:
             return self.start.own.keep_loops.astype(np.float64)
-        return self._answer.loop_weights.copy()
+        return _expanded(self._answer.loop_weights, self._keep_loops)
 
     def refuted(self, peer: str) -> bool:
         index = self._index[peer]
         if self._answer is None or index not in self._own.closures:
             return False
-        inliers = int(np.count_nonzero(self._answer.closure_weights[index] >= INLIER_WEIGHT))
+        inliers = int(np.count_nonzero(self.weights(peer) >= INLIER_WEIGHT))
         return inliers < self.config.closures.min_support
 
     def residuals(self) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig, InjectionConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
@@ -188,7 +189,11 @@ class AdmmSolver:
             except ValueError as error:
                 self.refused.append(str(error))
         self._arrived.clear()
-        self.agent.step()
+        try:
+            self.agent.step()
+        except DuagError as error:  # numbers that a neighbor sent; the poses stay
+            self.agent.step_change = np.inf
+            self.refused.append(str(error))
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
         packet = self.agent.outgoing(neighbor.name)
@@ -300,7 +305,10 @@ class EliminationSolver:
     def advance(self) -> None:
         self._arrived, refused = elimination_wire.take_messages(self.node, self._arrived, self.team)
         self.refused += refused
-        self.node.advance()
+        try:
+            self.node.advance()
+        except DuagError as error:  # numbers that a neighbor sent; the poses stay
+            self.refused.append(str(error))
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
         return []

@@ -133,7 +133,7 @@ def validate_peer_maps(
     own_colors = _ColorStatistics(config.min_color_variance)
     for view in views:
         own_colors.add(view.unit_color[... if view.mask is None else view.mask])
-    largest_m = config.max_size_ratio * _sizes_m(own).max(initial=0.0)
+    largest_m = config.max_size_ratio * _sizes_m(own).max() if len(own) else np.inf
     radius_m = config.match_radius_factor * matching.radius_m
     world, contradicted, judged = {own.owner: own}, {}, {}
     too_large = {}

@@ -227,10 +227,11 @@ def _finetuned(
             colors=fused.colors,
             keyframes=own.keyframes,
         )
-        if context.config.final_start == "drawn" and context.config.imports_all:
+        from_peers = len(shown) > 0 and context.config.imports_all
+        if from_peers and context.config.final_start == "drawn":
             seen = [*views[: own.keyframes], *shown]
             begun = most_drawn(fused, usable, valid.pairs, context, robot=own.robot, views=seen)
-        elif context.config.finer is not None and context.config.imports_all:
+        elif from_peers and context.config.finer is not None:
             begun = from_finest_views(
                 fused,
                 usable,

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.network import TransportConfig
 from duagc.pipeline.network.congestion import FULL_ROUNDS, MOST_ROUNDS, Congestion, LinkObserver, SendRate
 from duagc.pipeline.network.messages import Arrival, Message, Outgoing
@@ -121,8 +122,11 @@ class Transport:
     # --- outgoing
 
     def send(self, message: Message) -> None:
-        """Queue a reliable message."""
-        n = chunk_count(message.kind, len(message.payload))
+        """Queue a reliable message of at most `max_message_bytes`."""
+        size, most = len(message.payload), self.config.max_message_bytes
+        if size > most:  # every neighbor refuses it
+            raise DuagError(f"exchange.transport.max_message_bytes is {most}, expected at least {size}")
+        n = chunk_count(message.kind, size)
         self._open[message.id] = _Open(message, np.zeros(n, bool), np.zeros(n, np.int64))
 
     def cancel(self, message: int) -> None:

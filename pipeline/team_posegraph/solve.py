@@ -290,14 +290,15 @@ def _summary(
 ) -> dict[str, Any]:
     """The whole team: sums over the components, and the slowest of them."""
 
+    together = [c for c in components if len(c["robots"]) > 1]
+
     def total(name: str) -> Any:
         return sum(c[name] for c in components)
 
     def last(name: str, gap: str) -> int | None:
-        values = [c[name][gap] for c in components]
+        values = [c[name][gap] for c in together]
         return None if None in values else max(values)
 
-    together = [c for c in components if len(c["robots"]) > 1]
     optimum = total("optimum")
     return {
         "path": str(path),

@@ -91,3 +91,11 @@ def test_settings_that_differ_are_named_with_both_values() -> None:
     first, second = Whole(seed=7), Whole(link=Link(name="wire"))
     assert differing_settings(first, second) == [("seed", 7, 0), ("link.name", "radio", "wire")]
     assert differing_settings(first, first) == []
+
+
+@pytest.mark.parametrize("mu", ["[0.0, 300.0]", "[300.0, 1e-5]", "[-1.0, 300.0]"])
+def test_a_schedule_grows_from_above_zero(mu: str) -> None:
+    with pytest.raises(DuagError, match=r"consensus\.robust_mu is .*, expected 0 < first <= last"):
+        load_config(RunConfig, overrides=[f"exchange.consensus.robust_mu={mu}"])
+    same = load_config(RunConfig, overrides=["exchange.consensus.robust_mu=[1.0, 1.0]"])
+    assert same.exchange.consensus.robust_mu == (1.0, 1.0)

@@ -8,12 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig
-from duagc.pipeline.exchange.elected import solve_for_all
+from duagc.pipeline.consensus.admm_edge import SharedKeyframes
+from duagc.pipeline.consensus.tree import TreePlace
+from duagc.pipeline.exchange import elected
+from duagc.pipeline.exchange.elected import ElectedSolver, solve_for_all
+from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of
+from duagc.pipeline.exchange.solvers import LinkStart, SolverStart
 from duagc.pipeline.exchange.wire.elected_wire import (
     AnswerPart,
     GraphPart,
@@ -115,3 +121,97 @@ def test_a_session_comes_out_again_and_ends_where_the_others_end(make_robot: Any
     again, sent = replay_agent_of(data[1], config, seed=0, exchange_path=tmp_path / "elected.mcap")
     assert sent.equal
     assert same(again, found["elected"]["bravo"])
+
+
+def solver_of(
+    parts: dict[int, GraphPart], own: int, tree: TreePlace, keep: Any = None, **config: Any
+) -> ElectedSolver:
+    """One robot's side; the other end of its only link is the other robot of two."""
+    part, peer = parts[own], 1 - own
+    graph = OwnGraph(str(own), part.T_world_keyframe, part.trusted, np.zeros((5, 2)), part.loops)
+    closures = tuple(part.closures.get(peer, ()))
+    kept = np.ones(len(closures), bool) if keep is None else np.array(keep, bool)
+    shared = SharedKeyframes(np.arange(5, dtype=np.int32), np.ones((5, 6), np.float32))
+    link = LinkStart(peer, str(peer), shared, closures, kept, parts[peer].T_world_keyframe)
+    start = SolverStart(graph, own, part.T_world_keyframe[0], tree, [link])
+    return ElectedSolver(start, PoseConsensusConfig(**config), team=3)
+
+
+ROOT, LEAF = TreePlace(0, None, (1,), 0b11), TreePlace(1, 0, (), 0b10)
+
+
+@pytest.mark.parametrize("error", [DuagError, IndexError, np.linalg.LinAlgError, MalformedError])
+def test_a_root_that_cannot_solve_goes_on(error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts, _ = team_of_two(false=0)
+
+    def fail(*args: Any) -> Any:
+        raise error("no solution")
+
+    monkeypatch.setattr(elected, "solve_for_all", fail)
+    root = solver_of(parts, 0, ROOT)
+    root.take_message(1, write_graphs({1: parts[1]}))
+    root.advance()
+    assert root.refused == ["no solution"]
+    assert not root.converged
+    assert np.array_equal(root.T_world_keyframe, parts[0].T_world_keyframe)
+
+
+def test_graphs_of_robots_that_are_not_below_a_child_are_refused() -> None:
+    parts, _ = team_of_two(false=0)
+    for robots in ((0, 1), (1, 2), (2,), ()):
+        root = solver_of(parts, 0, ROOT)
+        root.take_message(1, write_graphs({r: parts[r] for r in robots}))
+        assert root.refused == ["graphs: lacks its sender, or has a robot that is not below it"]
+
+
+def test_information_is_measured_by_itself() -> None:
+    """Next to a large one, a small one that is negative is not rounding."""
+    parts, _ = team_of_two(false=0)
+    information = parts[1].trusted.information.copy()
+    information[0] *= 1e6
+    information[1, 0, 0] = -1.0
+    data = write_graphs({1: parts[1]})
+    old, new = (np.array(parts[1].trusted.information), information)
+    rows = np.triu_indices(6)
+    packed = [i[:, rows[0], rows[1]].astype("<f8").tobytes() for i in (old, new)]
+    assert data.count(packed[0]) == 1
+    with pytest.raises(MalformedError, match="negative"):
+        read_graphs(data.replace(*packed), 3)
+
+
+@pytest.mark.parametrize("lacks", ["weights", "one weight", "loops", "keyframe"])
+def test_an_answer_about_another_graph_is_refused(lacks: str) -> None:
+    parts, _ = team_of_two(false=0)
+    turned = {0: GraphPart(*list(vars(parts[1]).values())[:3], {}), 1: parts[0]}
+    parts = {0: turned[0], 1: GraphPart(*list(vars(parts[0]).values())[:3], {0: parts[0].closures[1]})}
+    child = solver_of(parts, 1, LEAF)
+    child.advance()
+    good = AnswerPart(parts[1].T_world_keyframe, np.zeros(0), {0: np.ones(4)})
+    bad = {
+        "weights": AnswerPart(good.T_world_keyframe, good.loop_weights, {}),
+        "one weight": AnswerPart(good.T_world_keyframe, good.loop_weights, {0: np.ones(3)}),
+        "loops": AnswerPart(good.T_world_keyframe, np.ones(1), good.closure_weights),
+        "keyframe": AnswerPart(good.T_world_keyframe[1:], good.loop_weights, good.closure_weights),
+    }[lacks]
+    child.take_message(0, write_answer({1: bad}))
+    assert child.refused == ["answer: of another graph"]
+    assert not child.converged
+    assert not child.refuted("0")
+    child.take_message(0, write_answer({1: good}))
+    assert child.converged
+    assert child.weights("0").tolist() == [1.0] * 4
+
+
+def test_without_robust_weights_only_kept_loop_closures_count() -> None:
+    parts, second = team_of_two(false=3)
+    keep = [1, 1, 0, 1, 0, 0, 0]
+    root = solver_of(parts, 0, ROOT, keep, robust=False)
+    assert root.weights("1").tolist() == keep
+    root.take_message(1, write_graphs({1: parts[1]}))
+    root.advance()
+    assert root.converged
+    assert root.weights("1").tolist() == keep
+    assert not root.refuted("1")
+    ((receiver, answer),) = root.messages()
+    assert receiver == 1
+    assert np.abs(read_answer(answer)[1].T_world_keyframe - second).max() < 1e-6

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
 from duagc.pipeline.network.link_model import LinkModel
 from duagc.pipeline.network.messages import Message
@@ -164,3 +165,11 @@ def test_a_packet_heard_twice_counts_once() -> None:
     assert arrival is not None
     assert arrival.complete
     assert end.receive(packet(kind=Kind.STATE, total=3, payload=b"abc", sequence=2), 1) is not None
+
+
+def test_a_message_that_every_neighbor_refuses_is_not_sent() -> None:
+    a, b = two_ends(TransportConfig(max_message_bytes=2000))
+    a.send(Message(1000, Kind.SAMPLE, bytes(2000)))
+    assert run(a, b, 0.0, 10)[0] == {1000: bytes(2000)}
+    with pytest.raises(DuagError, match="max_message_bytes is 2000, expected at least 2001"):
+        a.send(Message(1001, Kind.SAMPLE, bytes(2001)))

@@ -1,6 +1,7 @@
 """Messages: what is written is read back, and nothing else is accepted."""
 
 import contextlib
+import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -276,3 +277,21 @@ def test_compact_information_is_never_negative() -> None:
         values = np.linalg.eigvalsh(unpack_symmetric(back["information"][:, part], size))
         assert (values[:, 0] >= -1e-5 * np.maximum(values[:, -1], 1e-6)).all()
     assert (back["information"][:, 27:] >= 0).all()
+
+
+@pytest.mark.parametrize(("least", "taken"), [(1e-11, True), (1e-40, False), (0.0, False)])
+def test_a_metric_that_means_nothing_is_refused(least: float, taken: bool) -> None:
+    shared = SharedKeyframes(np.array([2, 6], np.int32), np.full((2, 6), least, np.float32))
+    data = loop_closing_wire.write_verdicts(loop_closing_wire.Verdicts(9, 5, 4, True, shared))
+    with contextlib.nullcontext() if taken else pytest.raises(MalformedError, match="metric"):
+        loop_closing_wire.read_verdicts(data, 7)
+
+
+def test_announced_poses_cost_no_memory_before_they_are_there() -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(MalformedError, match="more were announced"):
+            state_wire.Reader(bytes(96), "poses").poses(10**6)
+        assert tracemalloc.get_traced_memory()[1] < 10**6
+    finally:
+        tracemalloc.stop()

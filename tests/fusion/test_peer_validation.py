@@ -58,12 +58,17 @@ def map_of(robot: str, change=lambda theta: None, discs=()) -> Evidence:
 
 
 def validated_by_alpha(
-    views: list[PosedRgbd], bravo: Evidence, pairs=None, threads: int = 1, arrived: float = 1.0
+    views: list[PosedRgbd],
+    bravo: Evidence,
+    pairs=None,
+    threads: int = 1,
+    arrived: float = 1.0,
+    empty: bool = False,
 ) -> ValidatedPeers:
     ids = 10 + np.arange(N)
     pairs = {("alpha", "bravo"): np.stack([ids, ids], axis=1)} if pairs is None else pairs
     return validate_peer_maps(
-        map_of("alpha").in_world(HERE),
+        map_of("alpha").select(slice(0 if empty else None)).in_world(HERE),
         {"bravo": bravo.in_world(HERE)},
         pairs,
         MapContext(CAMERA, FusionConfig(), MapMatching(), threads=threads),
@@ -185,3 +190,9 @@ def test_threads_do_not_show(views):
     one, three = validated_by_alpha(views, bravo), validated_by_alpha(views, bravo, threads=3)
     assert one.checks == three.checks
     np.testing.assert_array_equal(one.contradicted["bravo"], three.contradicted["bravo"])
+
+
+def test_an_empty_own_map_takes_no_gaussian_for_too_large(views):
+    check = validated_by_alpha(views, map_of("bravo"), empty=True).checks[0]
+    assert (check.gaussians, check.too_large) == (N, 0)
+    assert check.trusted

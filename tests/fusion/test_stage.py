@@ -269,15 +269,30 @@ def test_a_merge_has_no_more_gaussians_than_it_may(robot, tmp_path):
     assert len(np.unique(refined.ids)) == 5
 
 
-def test_a_neighbor_that_contradicts_own_images_is_left_out(robot, tmp_path):
-    """A white wall where bravo saw a dark one, and one more Gaussian where bravo never looked."""
+def white_wall():
+    """Evidence of alpha: a white wall where bravo saw a dark one, and one more Gaussian where bravo never looked."""
     x, y = np.meshgrid(np.arange(-1.4, 1.4, 0.05), np.arange(-1.1, 1.1, 0.05))
     theta = np.zeros((x.size + 1, 13))
     theta[:-1, :3] = np.stack([x, y, np.full_like(x, 2.0)], axis=-1).reshape(-1, 3)
     theta[-1, :3] = [0, 0, -3.0]
     theta[:, 3:6], theta[:, 9:12], theta[:, 12] = 2 * np.log(0.03), 1.0, 4.0
     ids = np.arange(len(theta))
-    other = Evidence("alpha", ids, np.zeros(len(ids)), theta, np.ones((len(ids), 31)))
+    return Evidence("alpha", ids, np.zeros(len(ids)), theta, np.ones((len(ids), 31)))
+
+
+def test_the_training_begins_with_the_own_map_if_no_neighbor_is_used(robot, tmp_path):
+    result = result_of(robot, robot.T_map_keyframe, alpha=white_wall())
+    source = AgentInput("bravo", robot.log, robot.frontend, robot.information, 1e-3)
+    training = FinetuneConfig(steps_per_view=1, peer_views=2)
+    config = FusionConfig(final_start="drawn", most_final=5, explained_opacity=0.0, finetune=training)
+    run_fusion(source, result, tmp_path, **SETTINGS | {"config": config})
+    (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.REFINED_MAP.of("bravo")])
+    np.testing.assert_array_equal(record.message().gaussians.ids, robot.gaussians.ids)
+
+
+def test_a_neighbor_that_contradicts_own_images_is_left_out(robot, tmp_path):
+    other = white_wall()
+    ids = other.ids
     fused = fuse_files(robot, result_of(robot, robot.T_map_keyframe, alpha=other), tmp_path)[GaussianMap]
     assert len(fused.gaussians) == N
     (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.PEER_MAP_REPORT.of("bravo")])

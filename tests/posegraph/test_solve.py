@@ -208,3 +208,13 @@ def test_the_command_refuses_in_one_line(tmp_path):
     assert_one_line(duagc_here("posegraph", tmp_path / "absent.g2o"), "absent.g2o", "not found")
     path = write_g2o(tmp_path / "helix.g2o", helix_edges(N))
     assert_one_line(duagc_here("posegraph", path, "--robots", "40"), "48 poses", "40 robots")
+
+
+def test_a_robot_without_closures_does_not_hide_when_the_others_arrived(tmp_path):
+    rows = [(i, j, T) for i, j, T in helix_edges(N) if (i < 32) == (j < 32)]
+    result = solve.solve(write_g2o(tmp_path / "apart.g2o", rows), settings("admm"), 3)
+    together, alone = result["components"]
+    assert (together["robots"], alone["robots"]) == (["robot0", "robot1"], ["robot2"])
+    assert result["rounds_to"] == together["rounds_to"]
+    assert result["bytes_to"] == together["bytes_to"]
+    assert None not in together["rounds_to"].values()

@@ -118,3 +118,24 @@ def test_masks_come_back_and_name_no_other_keyframe(count):
     if count % 8:
         with pytest.raises(MalformedError, match="more than"):
             poses_wire.read_mask(data[:-1] + b"\xff", count)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"H": 1e31 * np.eye(6)}, {"g": np.full(6, 1e308)}, {"cost": np.inf}, {"largest_step": np.inf}],
+)
+def test_blocks_with_numbers_that_overflow_are_refused(changes):
+    block = Block(np.eye(6), np.zeros(6), 1.0, 0.0, reweighted=False, unsure=False)
+    elimination_wire.read_block(elimination_wire.write_block(0, block, "float64"), 1)
+    huge = dataclasses.replace(block, **changes)
+    with pytest.raises(MalformedError, match="block"):
+        elimination_wire.read_block(elimination_wire.write_block(0, huge, "float64"), 1)
+
+
+@pytest.mark.parametrize("changes", [{"damping": np.inf}, {"delta": np.full((1, 6), 1e308)}])
+def test_steps_with_numbers_that_overflow_are_refused(changes):
+    step = BackSubstitution(
+        0, accepted=True, finished=False, fresh=False, damping=0.0, delta=np.zeros((1, 6))
+    )
+    with pytest.raises(MalformedError, match="step"):
+        elimination_wire.read_step(elimination_wire.write_step(dataclasses.replace(step, **changes)), 1)

@@ -146,7 +146,8 @@ def _read_factors(reader: Reader, count: int) -> tuple[Index, Array, Array]:
     information = np.zeros((count, 6, 6))
     information[:, _UPPER[0], _UPPER[1]] = upper
     information[:, _UPPER[1], _UPPER[0]] = upper
-    if np.any(np.linalg.eigvalsh(information) < -1e-6 * (1 + np.abs(information).max(initial=0.0))):
+    values = np.linalg.eigvalsh(information)
+    if not np.all(values[:, 0] >= -1e-6 * np.maximum(values[:, -1], 0.0)):
         raise MalformedError("graphs: information that is negative")
     return ends, T, information
 

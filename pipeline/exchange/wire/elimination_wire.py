@@ -70,6 +70,7 @@ _STEP = struct.Struct("<BIBdI")
 _REWEIGHTED, _UNSURE, _DOUBLE, _NEW = 1, 2, 4, 8
 _ACCEPTED, _FINISHED, _FRESH = 1, 2, 4
 _UPPER = np.triu_indices(6)
+LARGEST = 1e30  # of a matrix, a gradient or a step: sums and products of such numbers do not overflow
 
 
 def write_front(variables: Mapping[Variable, int]) -> bytes:
@@ -131,12 +132,21 @@ def read_block(data: bytes, variables: int) -> tuple[int, Block]:
     """Number of the exchange and the block, over so many variables."""
     reader = Reader(data, "block")
     _, exchange, n, cost, largest_step, flags = reader.fields(_BLOCK)
-    if n != variables or not (cost >= 0 and largest_step >= 0) or flags >= 2 * _NEW:
+    possible = 0 <= cost < np.inf and 0 <= largest_step < np.inf
+    if n != variables or not possible or flags >= 2 * _NEW:
         raise MalformedError(f"block: over {n} variables, expected {variables}; or impossible numbers")
     g = reader.array("float64", (6 * n,))
     H = _read_matrix(reader, n, "float64" if flags & _DOUBLE else "float32") if flags & _NEW else None
     reader.done()
+    _check_size(g, "block")
+    if H is not None:
+        _check_size(H, "block")
     return exchange, Block(H, g, cost, largest_step, bool(flags & _REWEIGHTED), bool(flags & _UNSURE))
+
+
+def _check_size(numbers: Array, what: str) -> None:
+    if np.abs(numbers).max(initial=0.0) > LARGEST:
+        raise MalformedError(f"{what}: a number beyond {LARGEST:g}")
 
 
 def _read_matrix(reader: Reader, n: int, precision: str) -> Array:
@@ -167,8 +177,9 @@ def read_step(data: bytes, variables: int) -> BackSubstitution:
     delta = reader.array("float64", (n, 6))
     reader.done()
     accepted = bool(flags & _ACCEPTED)
-    if flags >= 2 * _FRESH or n != accepted * variables or not damping >= 0:
+    if flags >= 2 * _FRESH or n != accepted * variables or not 0 <= damping < np.inf:
         raise MalformedError(f"step: over {n} variables, expected {variables}; or impossible numbers")
+    _check_size(delta, "step")
     return BackSubstitution(exchange, accepted, bool(flags & _FINISHED), bool(flags & _FRESH), damping, delta)
 
 

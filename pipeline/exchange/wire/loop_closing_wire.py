@@ -22,6 +22,7 @@ from duagc.pipeline.registration import Reference, ReferenceLevel
 from duagc.pipeline.registration.features import DIMENSIONS, Descriptors, Features
 
 DIGEST_BYTES = 8
+LEAST_METRIC = 1e-12  # 1/m^2: a deviation as large as the largest coordinate
 
 
 def read_digest(data: bytes) -> bytes:
@@ -145,8 +146,8 @@ def read_verdicts(data: bytes, limit: int) -> Verdicts:
     reader.done()
     if n and (keyframes[0] < 0 or keyframes[-1] >= limit or np.diff(keyframes).min(initial=1) < 1):
         raise MalformedError(f"closures: shared keyframes must ascend and stay below {limit}")
-    if n and not (metric.min() > 0 and metric.max() < 1e15):
-        raise MalformedError("closures: the metric must be positive")
+    if n and not (metric.min() >= LEAST_METRIC and metric.max() < 1e15):
+        raise MalformedError(f"closures: the metric must be at least {LEAST_METRIC:g} and below 1e15")
     return Verdicts(candidates, verified, consistent, bool(joined), SharedKeyframes(keyframes, metric))
 
 

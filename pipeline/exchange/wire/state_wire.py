@@ -47,8 +47,9 @@ class Reader:
 
     def poses(self, n: int) -> Array:
         """Motions [n, 4, 4] from their upper rows, float64."""
+        rows = self.array("float64", (n, 3, 4))  # first: n is checked against the bytes that are there
         T = np.tile(np.eye(4), (n, 1, 1))
-        T[:, :3] = self.array("float64", (n, 3, 4))
+        T[:, :3] = rows
         R = T[:, :3, :3]
         if np.abs(R).max(initial=0.0) > 2.0 or np.abs(T[:, :3, 3]).max(initial=0.0) > MAX_COORDINATE:
             raise MalformedError(f"{self.what}: a pose is not a rigid motion, or beyond {MAX_COORDINATE:g} m")
