@@ -20,9 +20,10 @@ NEAREST_PLANE_M, NEAREST_FRONT_M = np.float32(1e-3), np.float32(0.05)
 def found_points(
     inverse_depth: Image,
     nearest: Image,
-    middle: float,
     camera: PinholeCamera,
     T_color_depth: NDArray[np.float64],
+    *,
+    middle: float,
 ) -> tuple[Image, Image, Image]:
     """Inverse depth [h, w] at the pixels of a camera (0: unknown), and the columns and rows where it was looked up.
 
@@ -32,16 +33,16 @@ def found_points(
     Args:
         inverse_depth: [h, w] of a depth image, 1/m, 0 where unknown.
         nearest: [h, w], 1/m, of the nearest surface around each pixel, with which the search begins; 0: none.
-        middle: 1/m, positive, with which it begins where there is none.
         camera: of both.
         T_color_depth: [4, 4], from the camera when depth was taken to the camera that looks for points.
+        middle: 1/m, positive, with which it begins where there is none.
     """
     x, y = np.meshgrid(*rays(camera))
     start = np.float32(middle)
-    found = _rounds(inverse_depth, np.where(nearest > 0, nearest, start), (x, y), camera, T_color_depth)
+    found = _rounds(inverse_depth, np.where(nearest > 0, nearest, start), (x, y), camera, T=T_color_depth)
     missing = found[0] == 0
     again = np.where(inverse_depth > 0, inverse_depth, start)[missing]
-    others = _rounds(inverse_depth, again, (x[missing], y[missing]), camera, T_color_depth)
+    others = _rounds(inverse_depth, again, (x[missing], y[missing]), camera, T=T_color_depth)
     for whole, part in zip(found, others, strict=True):
         whole[missing] = part
     return found
@@ -63,10 +64,12 @@ def _rounds(
     start: Image,
     ray: tuple[Image, Image],
     camera: PinholeCamera,
-    T_color_depth: NDArray[np.float64],
+    *,
+    T: NDArray[np.float64],
 ) -> tuple[Image, Image, Image]:
+    """Inverse depth, columns and rows of the pixels of some rays. T: T_color_depth."""
     fx, fy, cx, cy = (np.float32(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    smooth, T_depth_color = _smooth(inverse_depth), se3.inverse(T_color_depth)
+    smooth, T_depth_color = _smooth(inverse_depth), se3.inverse(T)
     found, one = start, np.float32(1)
     off = u = v = np.zeros_like(start)
     for _ in range(ROUNDS):
@@ -77,7 +80,7 @@ def _rounds(
         there = _look_up(inverse_depth, smooth, u, v)
         seen = there > 0
         depth_m = one / np.where(seen, there, one)
-        x, y, z = _transformed(T_color_depth, (u - cx) / fx * depth_m, (v - cy) / fy * depth_m, depth_m)
+        x, y, z = _transformed(T, (u - cx) / fx * depth_m, (v - cy) / fy * depth_m, depth_m)
         front = seen & (z > NEAREST_FRONT_M)
         z = np.where(front, z, one)
         off_u, off_v = (x / z - ray[0]) * fx, (y / z - ray[1]) * fy

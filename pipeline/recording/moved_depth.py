@@ -136,7 +136,7 @@ def move_depth(depth: DepthImage, camera: PinholeCamera, T_color_depth: Array) -
     side = 2 * min(int(np.ceil(farthest_px)) + 1, FARTHEST_EDGE_PX) + 1
     nearest = np.asarray(cv2.dilate(inverse, np.ones((side, side), dtype=np.uint8)), dtype=np.float32)
     middle = float(np.median(inverse[known]))
-    found, u, v = found_points(inverse, nearest, middle, camera, T_color_depth)
+    found, u, v = found_points(inverse, nearest, camera, T_color_depth, middle=middle)
     moved = np.where(found > 0, 1 / np.where(found > 0, found, 1), np.float32(0))
     if depth.sigma_m is None:
         return DepthImage(moved)

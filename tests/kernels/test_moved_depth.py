@@ -45,8 +45,8 @@ def test_points_are_those_of_the_definition(size: str, motion: str, isa: str) ->
     nearest = np.where(np.random.default_rng(1).random(inverse.shape) < 0.3, 0, inverse.max()).astype(
         np.float32
     )
-    found = moved_depth.found_points(inverse, nearest, 0.5, camera, T, isa=isa)
-    wanted = moved_depth_definition.found_points(inverse, nearest, 0.5, camera, T)
+    found = moved_depth.found_points(inverse, nearest, camera, T, middle=0.5, isa=isa)
+    wanted = moved_depth_definition.found_points(inverse, nearest, camera, T, middle=0.5)
     for ours, theirs in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(ours.view(np.int32), theirs.view(np.int32))
 
@@ -54,7 +54,7 @@ def test_points_are_those_of_the_definition(size: str, motion: str, isa: str) ->
 def test_what_does_not_move_is_found_where_it_is() -> None:
     camera = camera_of(64, 48)
     inverse = surfaces(camera)
-    found, u, v = moved_depth.found_points(inverse, inverse, 0.5, camera, np.eye(4))
+    found, u, v = moved_depth.found_points(inverse, inverse, camera, np.eye(4), middle=0.5)
     known = inverse > 0
     assert (found[known] > 0).mean() > 0.99
     np.testing.assert_allclose(found[known & (found > 0)], inverse[known & (found > 0)], rtol=1e-4)
@@ -66,16 +66,18 @@ def test_what_does_not_move_is_found_where_it_is() -> None:
 def test_an_image_without_depth_has_no_points() -> None:
     camera = camera_of(40, 30)
     nothing = np.zeros((30, 40), np.float32)
-    assert not moved_depth.found_points(nothing, nothing, 1.0, camera, se3.exp(MOTIONS["usual"]))[0].any()
+    assert not moved_depth.found_points(nothing, nothing, camera, se3.exp(MOTIONS["usual"]), middle=1.0)[
+        0
+    ].any()
 
 
 def test_images_of_another_size_and_no_start_are_refused() -> None:
     camera = camera_of(40, 30)
     image = np.ones((30, 40), np.float32)
     with pytest.raises(ValueError, match=r"nearest is float32 \(30, 39\), expected float32 \(30, 40\)"):
-        moved_depth.found_points(image, image[:, :39], 1.0, camera, np.eye(4))
+        moved_depth.found_points(image, image[:, :39], camera, np.eye(4), middle=1.0)
     with pytest.raises(ValueError, match=r"inverse_depth is float64 \(30, 40\)"):
-        moved_depth.found_points(image.astype(float), image, 1.0, camera, np.eye(4))
+        moved_depth.found_points(image.astype(float), image, camera, np.eye(4), middle=1.0)
     for middle in (0.0, float("nan")):
         with pytest.raises(ValueError, match="expected more than 0"):
-            moved_depth.found_points(image, image, middle, camera, np.eye(4))
+            moved_depth.found_points(image, image, camera, np.eye(4), middle=middle)
