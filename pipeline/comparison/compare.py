@@ -13,9 +13,10 @@ import numpy as np
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, read_text
 from duagc.pipeline.comparison.fields import Unequal, unequal
+from duagc.pipeline.comparison.recordings import description_of, files_of, made_otherwise, points_of
 from duagc.pipeline.comparison.summary import ORDER, stage_of
 from duagc.pipeline.comparison.tolerances import Tolerances
-from duagc.pipeline.recording import Record, log_metadata, read_log
+from duagc.pipeline.recording import RECORDING_FILE, Record, log_metadata, read_log
 from duagc.pipeline.runs.digest import digest_file, result_files
 
 SCHEMA = 1
@@ -114,6 +115,8 @@ def compare(first: Path, second: Path, tolerances: Tolerances = NOTHING) -> Comp
     names = sorted({*files[0], *files[1]}, key=lambda name: (ORDER.index(stage_of(name)), name))
     if kinds[0] == "a run":
         out.notes += _settings(first, second)
+    else:
+        out.notes += made_otherwise(first, second)
     for name in names:
         stage = stage_of(name) if kinds[0] == "a run" else "recording"
         missing = [str(path) for path, found in zip((first, second), files, strict=True) if name not in found]
@@ -128,7 +131,7 @@ def compare(first: Path, second: Path, tolerances: Tolerances = NOTHING) -> Comp
 def _kind(path: Path) -> str:
     if path.is_file():
         return "a log"
-    if (path / "recording.json").is_file():
+    if (path / RECORDING_FILE).is_file():
         return "a recording"
     if (path / "robots").is_dir():
         return "a run"
@@ -137,7 +140,7 @@ def _kind(path: Path) -> str:
 
 def _files(path: Path, kind: str) -> list[str]:
     if kind == "a recording":
-        return [p.name for p in path.glob("*.mcap")]
+        return files_of(path)
     found = [p.as_posix() for p in result_files(path)]
     return [*found, METRICS] if (path / METRICS).is_file() else found
 
@@ -166,14 +169,15 @@ def _compare_files(
         return
     if digest_file(first) == digest_file(second):
         return
-    found = unequal(_content(first), _content(second))
+    read = _content_of_recording if stage == "recording" else _content
+    found = unequal(read(first), read(second))
     beyond = _beyond(out, name, found, tolerances)
     if name == METRICS:
         out.differences += [Difference(stage, name, "", f.text(), fields=(_plain(f),)) for f in beyond]
     elif beyond:
         text = "; ".join(f.text() for f in beyond)
         out.differences.append(Difference(stage, name, "", text, fields=tuple(map(_plain, beyond))))
-    elif not found:
+    elif not found and name != RECORDING_FILE:
         out.differences.append(Difference(stage, name, "", "other bytes, equal values"))
 
 
@@ -192,6 +196,10 @@ def _content(path: Path) -> dict[str, Any]:
         return dict(json.loads(read_text(path, "a result of a run")))
     except (ValueError, TypeError) as error:
         raise DuagError(f"{path}: {error}, expected a JSON object") from error
+
+
+def _content_of_recording(path: Path) -> dict[str, Any]:
+    return description_of(path.parent) if path.name == RECORDING_FILE else points_of(path)
 
 
 def _beyond(out: Compared, where: str, found: list[Unequal], tolerances: Tolerances) -> list[Unequal]:
@@ -239,7 +247,8 @@ def _text(fields: list[Unequal], most: int = 4) -> str:
 
 def _plain(found: Unequal) -> dict[str, Any]:
     finite = found.largest is None or np.isfinite(found.largest)
-    return vars(found) | {"largest": found.largest if finite else None}
+    plain = {name: value for name, value in vars(found).items() if name not in ("gaps", "sizes")}
+    return plain | {"largest": found.largest if finite else None}
 
 
 def _opened(metadata: Any) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ class Unequal:
         count: elements that differ.
         largest: absolute difference; None if that makes no sense.
         scale: absolute value on the first side where the difference is largest.
+        gaps: absolute differences of the elements that differ, [count].
+        sizes: their absolute values on the first side, [count].
     """
 
     name: str
@@ -31,6 +33,20 @@ class Unequal:
     count: int = 1
     largest: float | None = None
     scale: float = 0.0
+    gaps: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0), repr=False, compare=False)
+    sizes: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0), repr=False, compare=False)
+
+    def within(self, absolute: float, relative: float) -> bool:
+        """Whether no element differs by more than a tolerance.
+
+        Args:
+            absolute: part of the tolerance that is the same for all elements.
+            relative: part of it by the absolute value of the element on the first side.
+        """
+        if self.largest is None:
+            return False
+        sizes = np.where(np.isfinite(self.sizes), self.sizes, 0.0)
+        return bool((self.gaps <= absolute + relative * sizes).all())
 
     def text(self) -> str:
         """In words."""
@@ -95,17 +111,29 @@ def _compare(name: str, first: Any, second: Any) -> Unequal | None:
     if not differ.any():
         return None
     place = tuple(int(i) for i in np.argwhere(differ)[0])
-    largest, scale = None, 0.0
+    largest, scale, gaps, sizes = None, 0.0, np.zeros(0), np.zeros(0)
     if a.dtype.kind in "fiu" and b.dtype.kind in "fiu":
         with np.errstate(invalid="ignore", over="ignore"):
             gap = np.where(differ, np.abs(a.astype(np.float64) - b.astype(np.float64)), 0.0)
         gap = np.where(np.isnan(gap), np.inf, gap)
         largest = float(gap.max())
-        scale = float(np.abs(a.astype(np.float64).ravel()[int(gap.argmax())]))
+        size = np.abs(a.astype(np.float64))
+        scale = float(size.ravel()[int(gap.argmax())])
+        gaps, sizes = gap[differ], size[differ]
     shown = f"[{', '.join(map(str, place))}]" if place else ""
     first_text, second_text = _text(a[place].item()), _text(b[place].item())
     count = int(differ.sum())
-    return Unequal(name, shown, first_text, second_text, count=count, largest=largest, scale=scale)
+    return Unequal(
+        name,
+        shown,
+        first_text,
+        second_text,
+        count=count,
+        largest=largest,
+        scale=scale,
+        gaps=gaps,
+        sizes=sizes,
+    )
 
 
 def _both_nan(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:

@@ -28,7 +28,7 @@ class Tolerance(Config):
     """In the unit of the field."""
 
     relative: float = 0.0
-    """Of the value of the first run."""
+    """Of the value of the first run, element by element."""
 
     reason: str
     """Why this much is right."""
@@ -47,11 +47,9 @@ class Tolerances:
             where: topic or file.
             found: the difference.
         """
-        if found.largest is None:
-            return False
         for row in self.rows:
             if fnmatchcase(where, row.where) and fnmatchcase(found.name, row.field):
-                return found.largest <= row.absolute + row.relative * found.scale
+                return found.within(row.absolute, row.relative)
         return False
 
 

@@ -12,7 +12,7 @@ import pytest
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.comparison.compare import Compared, compare
 from duagc.pipeline.comparison.fields import unequal
-from duagc.pipeline.comparison.tolerances import Tolerances, read_tolerances
+from duagc.pipeline.comparison.tolerances import Tolerance, Tolerances, read_tolerances
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.recording import LogWriter, log_metadata, read_log
 from duagc.pipeline.splat.ply import write_ply
@@ -183,6 +183,49 @@ def test_logs_and_maps_and_recordings_are_compared(fake: fake_run.FakeRun, tmp_p
     (found,) = compare(tmp_path / "first", tmp_path / "second").differences
     assert found.where == ""
     assert "means[0, 0]: " in found.text
+
+
+def test_descriptions_and_geometry_of_recordings_are_compared(fake: fake_run.FakeRun, tmp_path: Path) -> None:
+    other = tmp_path / "recording"
+    shutil.copytree(fake.recording, other)
+    path = other / "recording.json"
+    description = json.loads(path.read_text())
+    row = description["robots"]["alpha"]
+    row["digests"], description["name"] = {}, "another"
+    description["parameters"]["seed"] = 7
+    path.write_text(json.dumps(description))
+    found = compare(fake.recording, other)
+    assert found.equal
+    assert found.notes == ["recording.json parameters.seed: absent and 7"]
+    row["depth_scale_m"] *= 2
+    path.write_text(json.dumps(description))
+    geometry = other / "groundtruth.ply"
+    content = bytearray(geometry.read_bytes())
+    content[-1] ^= 1  # blue of the last point
+    geometry.write_bytes(content)
+    found = compare(fake.recording, other)
+    assert [(d.stage, d.file) for d in found.differences] == [
+        ("recording", "groundtruth.ply"),
+        ("recording", "recording.json"),
+    ]
+    assert re.match(r"blue\[\d+\]: 0 and 1$", found.differences[0].text)
+    assert found.differences[1].text == "robots.alpha.depth_scale_m: 0.001 and 0.002"
+    geometry.write_bytes(b"ply\nformat ascii 1.0\n")
+    assert "bytes: absent and " in compare(fake.recording, other).differences[0].text
+    geometry.unlink()
+    assert compare(fake.recording, other).differences[0].text == f"not in {other}"
+
+
+def test_a_relative_tolerance_is_of_each_element() -> None:
+    def allowed(first: object, second: object, **row: float) -> bool:
+        (found,) = unequal({"x": np.array(first)}, {"x": np.array(second)})
+        return Tolerances((Tolerance(where="*", field="x", reason="a test", **row),)).allow("run", found)
+
+    assert allowed([1000.0, 1.0], [1001.0, 1.001], relative=0.01)
+    assert not allowed([1000.0, 1.0], [1001.0, 1.5], relative=0.01)
+    assert allowed([1000.0, 1.0], [1001.0, 1.5], relative=0.01, absolute=0.5)
+    assert not allowed([np.inf], [1.0], relative=0.01)
+    assert not allowed([1.0], [np.nan], relative=0.01, absolute=1.0)
 
 
 def test_different_kinds_are_one_line(fake: fake_run.FakeRun, tmp_path: Path) -> None:
