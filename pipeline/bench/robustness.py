@@ -2,7 +2,7 @@
 
 A cell is a value of a dial. Each is simulated with exact truth, run with the settings of every other run, and measured.
 The clean cell has all dials at zero. A cell that is finished is kept, with the digest of the code and of the settings
-that made it, and is computed again when either changes.
+that made it, and is computed again when either changes, or if its run failed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from duagc.converters.simulate.sensors.rig import Rig
 from duagc.converters.simulate.team import simulate
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.bench.cell_digests import code_digest, mesh_digest
 from duagc.pipeline.evaluation import coverage, trajectory_errors
 from duagc.pipeline.evaluation.results import Absent, write_json
 from duagc.pipeline.evaluation.true_paths import TruePaths
@@ -197,8 +198,9 @@ def run(
         The rows, in the order of the cells.
     """
     (out / "cells").mkdir(parents=True, exist_ok=True)
-    made_by = hashlib.sha256(f"{_code_digest()}\n{settings}".encode()).hexdigest()
-    wanted = {cell: {"cell": asdict(cell), "plan": _plain(plan), "made_by": made_by} for cell in plan.cells()}
+    made_by = hashlib.sha256(f"{code_digest()}\n{settings}".encode()).hexdigest()
+    plain = _plain(plan)
+    wanted = {cell: {"cell": asdict(cell), "plan": plain, "made_by": made_by} for cell in plan.cells()}
     found = {cell: row for cell, want in wanted.items() if (row := _kept(out, cell, want)) is not None}
     waiting = [cell for cell in plan.cells() if cell not in found]
 
@@ -351,8 +353,8 @@ def _within(value: float | None, most: float) -> bool:
 
 
 def _plain(plan: RobustnessPlan) -> dict[str, Any]:
-    """What a cell depends on: all but which other cells there are."""
-    plain = asdict(plan) | {"size": list(plan.size)}
+    """What a cell depends on: all but which other cells there are; of a folder of meshes also what they are."""
+    plain = asdict(plan) | {"size": list(plan.size)} | mesh_digest(plan.scene)
     del plain["dials"], plain["levels"]
     return plain
 
@@ -364,7 +366,7 @@ def _file(out: Path, cell: Cell) -> Path:
 def _kept(out: Path, cell: Cell, want: dict[str, Any]) -> dict[str, Any] | None:
     kept = _read(out, cell)
     row: dict[str, Any] | None = kept.pop("row", None)
-    return row if kept == want else None
+    return row if kept == want and row is not None and "failed" not in row else None
 
 
 def finished_row(out: Path, cell: Cell, plan: RobustnessPlan) -> dict[str, Any] | None:
@@ -385,15 +387,3 @@ def _read(out: Path, cell: Cell) -> dict[str, Any]:
         return dict(json.loads(_file(out, cell).read_text()))
     except (OSError, ValueError):
         return {}
-
-
-def _code_digest() -> str:
-    """Digest of all code that a cell runs through."""
-    from duagc import converters, pipeline
-
-    digest = hashlib.sha256()
-    for package in (converters, pipeline):
-        root = Path(next(iter(package.__path__)))
-        for path in sorted(p for p in root.rglob("*") if p.suffix in (".py", ".so")):
-            digest.update(f"{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes())
-    return digest.hexdigest()

@@ -82,28 +82,70 @@ def no_images(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_images")
-def test_a_run_that_cannot_be_is_a_row_that_says_so_and_cells_are_kept(tmp_path: Path) -> None:
+def test_a_run_that_cannot_be_is_a_row_that_says_so_and_is_tried_again(tmp_path: Path) -> None:
     rows = bench.run(PLAN, tmp_path / "out", refuse, "settings", workers=1)
     assert [r["dial"] for r in rows] == ["clean", "missing", "vignette"]
     assert all(r["failed"].endswith("nothing can be tracked") for r in rows)
     assert str(tmp_path) not in json.dumps(rows)
     assert not list((tmp_path / "out" / "runs").iterdir())
     seen: list[Path] = []
-    remember = lambda recording, run: seen.append(recording)  # noqa: E731
-    assert bench.run(PLAN, tmp_path / "out", remember, "settings", workers=1) == rows
-    assert not seen
-    (tmp_path / "out" / "cells" / "missing-1.json").write_text("{")
-    assert bench.run(PLAN, tmp_path / "out", refuse, "settings", workers=1) == rows
+
+    def refuse_again(recording: Path, run: Path) -> None:
+        seen.append(recording)
+        refuse(recording, run)
+
+    assert bench.run(PLAN, tmp_path / "out", refuse_again, "settings", workers=1) == rows
+    assert len(seen) == 3
 
 
-@pytest.mark.usefixtures("no_images")
+@pytest.fixture
+def no_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is kept does not depend on what a run comes to."""
+    monkeypatch.setattr(bench, "measured", lambda run, recording: {"frames": 7})
+    monkeypatch.setattr(bench, "Recording", lambda path: None)
+
+
+@pytest.mark.usefixtures("no_images", "no_numbers")
+def test_finished_cells_are_kept_unless_they_are_damaged(tmp_path: Path) -> None:
+    calls: list[Path] = []
+    count = lambda recording, run: calls.append(recording)  # noqa: E731
+    rows = bench.run(PLAN, tmp_path, count, "settings", workers=1)
+    assert bench.run(PLAN, tmp_path, count, "settings", workers=1) == rows
+    assert len(calls) == 3
+    (tmp_path / "cells" / "missing-1.json").write_text("{")
+    assert bench.run(PLAN, tmp_path, count, "settings", workers=1) == rows
+    assert len(calls) == 4
+
+
+@pytest.mark.usefixtures("no_images", "no_numbers")
+def test_other_meshes_make_a_cell_again(tmp_path: Path) -> None:
+    calls: list[Path] = []
+    count = lambda recording, run: calls.append(recording)  # noqa: E731
+    scene = tmp_path / "house"
+    (scene / "textures").mkdir(parents=True)
+    plan = replace(PLAN, dials=(), scene=str(scene))
+    for file, content, expected in (
+        ("wall.obj", "v 0 0 0", 1),
+        ("wall.obj", "v 0 0 0", 1),
+        ("wall.obj", "v 0 0 1", 2),
+        ("textures/wall.PNG", "paint", 3),
+        ("readme.txt", "a house", 3),
+    ):
+        (scene / file).write_text(content)
+        bench.run(plan, tmp_path / "out", count, "settings", workers=1)
+        assert len(calls) == expected
+    assert bench.finished_row(tmp_path / "out", bench.Cell(bench.CLEAN, 0.0), plan) is not None
+    (scene / "wall.obj").write_text("v 0 1 0")
+    assert bench.finished_row(tmp_path / "out", bench.Cell(bench.CLEAN, 0.0), plan) is None
+
+
+@pytest.mark.usefixtures("no_images", "no_numbers")
 def test_other_settings_or_another_walk_make_a_cell_again(tmp_path: Path) -> None:
     plan = replace(PLAN, dials=())
     calls = []
 
     def count(recording: Path, run: Path) -> None:
         calls.append(recording)
-        refuse(recording, run)
 
     for settings, wanted, expected in (
         ("one", plan, 1),

@@ -1,0 +1,45 @@
+"""What a cell of `duagc bench robustness` is made from, as digests: code, and meshes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from duagc.converters.simulate.render import mesh_process, meshes
+from duagc.converters.simulate.scenes.catalog import SCENES
+
+
+def code_digest() -> str:
+    """Digest of all code that a cell runs through."""
+    from duagc import converters, pipeline
+
+    digest = hashlib.sha256()
+    for package in (converters, pipeline):
+        root = Path(next(iter(package.__path__)))
+        for path in _files(root, (".py", ".so")):
+            digest.update(f"{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def mesh_digest(scene: str) -> dict[str, str]:
+    """Digest of the meshes of a scene and of what they may refer to, by name; empty for a scene without a folder.
+
+    Args:
+        scene: as of `duagc simulate`.
+    """
+    folder = Path(scene)
+    if scene in SCENES or not folder.is_dir():
+        return {}
+    digest = hashlib.sha256()
+    for path in _files(folder, (*meshes.UP_OF_SUFFIX, *mesh_process.OTHERS)):
+        with path.open("rb") as stream:
+            content = hashlib.file_digest(stream, "sha256").hexdigest()
+        digest.update(f"{path.relative_to(folder).as_posix()}\0{content}\n".encode())
+    return {"meshes": digest.hexdigest()}
+
+
+def _files(root: Path, suffixes: Iterable[str]) -> list[Path]:
+    """Files below a folder that end so, in order."""
+    wanted = set(suffixes)
+    return sorted(path for path in root.rglob("*") if path.suffix.lower() in wanted and path.is_file())
