@@ -7,6 +7,9 @@ from pathlib import Path
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cache.carrier import intact, words
+from duagc.pipeline.cache.file_digests import FileDigest
+from duagc.pipeline.cache.stage_key import StageKey
+from duagc.pipeline.cache.store import Store, StoredResults
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.job import READERS, Job
 from duagc.pipeline.preparation import Say, stages_of
@@ -57,6 +60,24 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
             log(f"{out / name}: is not what was computed; taken from the store")
             return False
     return True
+
+
+def measured_otherwise(out: Path, store: Path) -> str:
+    """The first file of the evaluation that is not as the manifest names it; "" if all are.
+
+    Users may measure a run again as they like, but a batch compares runs that were measured alike.
+
+    Args:
+        out: folder of a run that is up to date.
+        store: of results, which remembers digests of files.
+    """
+    row = stages_of(out).get(stages.EVALUATION.name, {"files": {}})
+    try:
+        files = {name: FileDigest(**digest) for name, digest in row["files"].items()}
+    except (KeyError, TypeError, AttributeError):  # somebody has written into that manifest
+        return "manifest.json"
+    named = StoredResults(StageKey(stages.EVALUATION.name, None, {}, {}, {}, {}), files)
+    return intact(out, named, Store(store).files)
 
 
 def why(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan) -> list[str]:

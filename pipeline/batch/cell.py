@@ -116,7 +116,7 @@ def run_cell(suite_path: Path, out: Path, name: str, store: Path) -> str:
 
 def _run(suite_path: Path, out: Path, name: str, store: Path) -> None:
     from duagc.pipeline.batch.suite import read_suite
-    from duagc.pipeline.existing_run import is_up_to_date
+    from duagc.pipeline.existing_run import is_up_to_date, measured_otherwise
     from duagc.pipeline.recording import Recording
     from duagc.pipeline.run_plan import RunPlan
     from duagc.pipeline.runner import run
@@ -132,8 +132,11 @@ def _run(suite_path: Path, out: Path, name: str, store: Path) -> None:
         plan = RunPlan(workers, store=store, until=cell.until)
         try:
             if is_up_to_date(Recording(cell.folder), folder, cell.config, plan, log=say):
-                say(f"{folder}: up to date")
-                return
+                changed = measured_otherwise(folder, store)
+                if not changed:
+                    say(f"{folder}: up to date")
+                    return
+                say(f"{folder / changed}: is not what was computed; taken from the store")
         except DuagError as error:  # the suite is another one than it was; its runs are ours to replace
             say(str(error))
     run(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from duagc.pipeline.base.component_names import submap_of
 from duagc.pipeline.base.files import new_file, read_text
 from duagc.pipeline.base.templates import filled
 from duagc.pipeline.batch.cell import CellState, read_state, run_folder
@@ -64,11 +65,18 @@ def numbers_of(run: Path) -> dict[str, float | str | None]:
         for name in ("wall_s", "cpu_s"):
             out[f"time.{name}"] = round(math.fsum(row[name] for row in rows), 3)
         out["time.peak_rss_mb"] = max(row["peak_rss_mb"] for row in rows)
-        frames = [v for k, v in out.items() if k.startswith("robots.") and k.endswith(".frames")]
+        frames = [v for k, v in out.items() if _counts_frames(k)]
         known = [value for value in frames if isinstance(value, float) and value > 0]
         if known and any("parts" in row for row in rows):
             out["time.tracking_ms_per_frame"] = round(1e3 * _tracking_s(rows) / math.fsum(known), 3)
     return out
+
+
+def _counts_frames(name: str) -> bool:
+    """Whether a number counts the frames of a log; every component of a robot has all of its robot's."""
+    section, _, rest = name.partition(".")
+    robot, _, last = rest.rpartition(".")
+    return section == "robots" and last == "frames" and submap_of(robot) is None
 
 
 def _tracking_s(rows: Sequence[Mapping[str, Any]]) -> float:

@@ -338,12 +338,13 @@ def _row(plan: Plan, source: Recording, job: _Job) -> dict[str, Any]:
                 row
                 | measured
                 | {"frames": len(estimated)}
-                | trajectory_errors_of(source, job.robot, estimated)
+                | trajectory_errors_of(source, job.robot, estimated, estimated.stamps_ns)
             )
         measured = pool.submit(
             measure, log, folder, job.config, seed=plan.seed, threads=plan.threads
         ).result()
         robot = RobotRun(job.robot, folder)
+        stamps_ns = np.array([f.stamp_ns for f in robot.frames], dtype=np.int64)
         placed = [f for f in robot.frames if f.status != "lost"]
         estimated = Trajectory(
             np.array([f.stamp_ns for f in placed], dtype=np.int64), np.array([f.T_map_camera for f in placed])
@@ -353,7 +354,7 @@ def _row(plan: Plan, source: Recording, job: _Job) -> dict[str, Any]:
             "lost": len(robot.frames) - len(placed),
             "keyframes": len(robot.keyframes),
         }
-        row |= trajectory_errors_of(source, job.robot, estimated)
+        row |= trajectory_errors_of(source, job.robot, estimated, stamps_ns)
         row |= agreement_of(source, robot, estimated)
         if job.config.mapping_enabled:
             row |= {"max_gaussians": job.config.mapping.max_gaussians}

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from duagc.pipeline.evaluation import groundtruth, map_agreement, trajectory_errors, views
 from duagc.pipeline.evaluation.rendering import PosedMap, RenderTask
 from duagc.pipeline.evaluation.results import Absent
@@ -14,13 +17,22 @@ from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RobotRun
 
 
-def trajectory_errors_of(source: Recording, robot: str, estimated: Trajectory) -> dict[str, Any]:
-    """ATE after an SE(3) alignment of its own and relative errors frame to frame, where there is ground truth."""
+def trajectory_errors_of(
+    source: Recording, robot: str, estimated: Trajectory, log_stamps_ns: NDArray[np.int64]
+) -> dict[str, Any]:
+    """ATE after an SE(3) alignment of its own and relative errors frame to frame, where there is ground truth.
+
+    Args:
+        source: the recording.
+        robot: whose path it is.
+        estimated: the path; lost frames are not in it.
+        log_stamps_ns: of all frames of the log, int64 [n].
+    """
     true = groundtruth.trajectory(source, robot)
     if isinstance(true, Absent):
         return dict.fromkeys(("ate_rmse_m", "rpe_trans_m", "rpe_rot_rad"), true)
     pairs = trajectory_errors.pair(true, estimated)
-    relative = trajectory_errors.rpe(pairs)
+    relative = trajectory_errors.rpe(pairs, log_stamps_ns)
     trans_m, rot_rad = (relative, relative) if isinstance(relative, Absent) else relative
     return {
         "ate_rmse_m": trajectory_errors.ate_rmse_m(pairs),

@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from duagc.pipeline.base.component_names import submap_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.machine import processors
 from duagc.pipeline.base.progress import track
@@ -98,20 +99,21 @@ def _row(plan: LengthPlan, source: Recording, seconds: float, folder: Path) -> d
     begun = out.exists() or out.with_name(f"{out.name}.part").exists()
     done = execute(THIS, part.path, out, processors=plan.threads, options=plan.options)
     front = [row for row in done.stages.values() if row["stage"] == "frontend"]
-    robots, team = list(done.metrics["robots"].values()), done.metrics["team"]
+    parts, team = done.metrics["robots"], done.metrics["team"]
+    robots = [row for name, row in parts.items() if submap_of(name) is None]
     own = done.metrics["rendering"]["own"]["held_out"]
-    frames = sum(row["frames"] for row in robots)
+    frames = sum(row["frames"] for row in robots)  # each component has all frames of its log
     return {
         "seconds": seconds,
         "frames": frames,
-        "keyframes": sum(row["keyframes"] for row in robots),
+        "keyframes": sum(row["keyframes"] for row in parts.values()),
         "cpu_s": round(sum(row["cpu_s"] for row in done.stages.values()) / len(robots), 3),
         "frontend_cpu_s": round(sum(row["cpu_s"] for row in front) / len(front), 3),
         "tracking_ms": round(1e3 * sum(row["parts"]["tracking_s"] for row in front) / frames, 3),
         "wall_s": None if begun else round(done.wall_s, 3),
         "frontend_peak_mb": max(row["peak_rss_mb"] for row in front),
         "peak_memory_mb": max(row["peak_rss_mb"] for row in done.stages.values()),
-        "gaussians": sum(row["gaussians"] for row in robots),
+        "gaussians": sum(row["gaussians"] for row in parts.values()),
         "sent_mb": round(1e-6 * done.metrics["exchange"]["bytes_sent"], 3),
         "joined": team["robots_in_largest_component"],
         "ate_m": team["ate_rmse_m"],

@@ -1,6 +1,7 @@
 """Commands that show what happened in a run, and hand its maps to other programs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -46,8 +47,14 @@ def export(
         typer.Option("--robot", help="Whose map; repeatable. Default: all robots.", show_default=False),
     ] = None,
     min_opacity: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="With --points: leave out Gaussians below it.")
-    ] = 0.5,
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="With --points: leave out Gaussians below it. Default: 0.5.",
+            show_default=False,
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Write each robot's final map as .ply for splat viewers, or as a point cloud; whole or in tiles.
@@ -61,7 +68,11 @@ def export(
     from duagc.pipeline.viewing.map_export import ExportPlan
     from duagc.pipeline.viewing.map_export import export as export_maps
 
-    plan = ExportPlan("points" if points else "splats", tile, tuple(robots or ()), min_opacity)
+    if min_opacity is not None and not points:
+        raise typer.BadParameter("expected together with --points", param_hint="--min-opacity")
+    plan = ExportPlan("points" if points else "splats", tile, tuple(robots or ()))
+    if min_opacity is not None:
+        plan = replace(plan, min_opacity=min_opacity)
     files = export_maps(run_folder, out, plan, force=force)
     size_mb = sum(path.stat().st_size for path in files) / 1e6
     say(f"{len(files)} file{'s' * (len(files) != 1)}, {size_mb:.1f} MB")

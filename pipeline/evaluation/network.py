@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.component_names import same_robot
+from duagc.pipeline.base.component_names import robot_of, same_robot
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation.oracle import NO_MATCHES, gap_to_oracle, matches_among
 from duagc.pipeline.evaluation.results import Absent
@@ -222,7 +222,7 @@ class Session:
         """The section `exchange` of metrics.json."""
         p = self.packets
         ticks, matched = self.summary.rounds, self.matched_pairs()
-        robot_pairs = len({frozenset((link.sender, link.receiver)) for link in self.links})
+        robot_pairs = len({frozenset(map(robot_of, (link.sender, link.receiver))) for link in self.links})
         sent = int(p.size_bytes.sum())
         per_pair = sent / (ticks * robot_pairs) if ticks * robot_pairs else NO_EXCHANGE
         return {

@@ -25,6 +25,7 @@ from duagc.pipeline.evaluation.pixel_deviation import (
 from duagc.pipeline.evaluation.rendering import (
     NONE_MET,
     REASONS,
+    held_out_of,
     mates,
     poses_by_stamp,
     scored_frames,
@@ -144,7 +145,7 @@ class _Views:
                         found.append((kind, self._of(rendered, view, sample)))
                 return found
 
-            chosen = spread(robot.held_out, self.most)
+            chosen = spread(held_out_of(robot), self.most)
             for found in in_order(of_view, scored_frames(log, chosen, source, robot), threads):
                 yield from found
 

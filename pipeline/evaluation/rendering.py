@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
+from duagc.pipeline.base.component_names import same_robot
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
@@ -36,6 +37,8 @@ MOST_VIEWS = 40
 APART_PX, MOST_MOMENTS = 1.5, 15
 """Places from which a view is drawn whose camera moved: about as dense as pixels."""
 COMPARED_SETS = ("held_out", "peers", "team")
+OTHER_COMPONENT = "other_component"
+"""Reason of a frame without a pose that has one in another component of its robot."""
 NONE_MET = "no robot met another, or the settings train no final map"
 NOT_ASKED = "not asked for: duagc evaluate --own-longer"
 REASONS = {
@@ -189,8 +192,8 @@ def rendering_sections(of_robots: Mapping[str, Sequence[Scored]], *, longer: boo
 
 
 def mates(run: RunFolder, robot: RobotRun) -> list[RobotRun]:
-    """The other robots that agree with this one on who shares their world."""
-    others = [run.robots[r] for r in robot.component if r != robot.robot]
+    """The other robots that agree with this one on who shares their world; its own other components are none."""
+    others = [run.robots[r] for r in robot.component if not same_robot(r, robot.robot)]
     return [other for other in others if other.component == robot.component]
 
 
@@ -237,7 +240,7 @@ class RenderTask:
     def chosen(self) -> list[int]:
         """Frames of the set, evenly spread, in order."""
         keyframes = {k.frame_index for k in self.camera_robot.keyframes}
-        return spread(self.camera_robot.held_out if self.view_set == "held_out" else keyframes, self.most)
+        return spread(held_out_of(self.camera_robot) if self.view_set == "held_out" else keyframes, self.most)
 
     def scores(
         self, source: Recording, threads: int, title: str | None, *, skip: int = 0
@@ -253,6 +256,11 @@ class RenderTask:
                 maps, log.camera, frames, threads=threads, depth=self.depth, compared=IN_EVERY_RUN
             )
             yield from track(found, title, total=len(chosen)) if title else found
+
+
+def held_out_of(robot: RobotRun) -> frozenset[int]:
+    """Held-out frames of a robot, lost ones too, but none of its other components: those are theirs to score."""
+    return robot.held_out - {f.frame_index for f in robot.frames if f.reason == OTHER_COMPONENT}
 
 
 def spread(frames: Collection[int], most: int) -> list[int]:

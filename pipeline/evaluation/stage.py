@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from duagc.pipeline.base.component_names import robot_of
+from duagc.pipeline.base.component_names import robot_of, submap_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.worker_reports import OF_TEAM, Hear
 from duagc.pipeline.evaluation import (
@@ -177,7 +177,7 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
         "gaussians": len(robot.own_map.gaussians),
         "gaussians_fused": len(robot.fused_map.gaussians),
         "stated_scale": _stated_scale(robot),
-        "robots_in_component": len(robot.component),
+        "robots_in_component": len({robot_of(name) for name in robot.component}),
     }
     if isinstance(after, Absent) or isinstance(before, Absent):
         absent = after if isinstance(after, Absent) else before
@@ -185,7 +185,8 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
         return (
             section | dict.fromkeys((*names, "rpe_trans_m", "rpe_rot_rad"), absent) | {"frames_with_truth": 0}
         )
-    relative = trajectory_errors.rpe(after)
+    log_stamps_ns = np.array([frame.stamp_ns for frame in robot.frames], dtype=np.int64)
+    relative = trajectory_errors.rpe(after, log_stamps_ns)
     rpe_trans_m, rpe_rot_rad = (relative, relative) if isinstance(relative, Absent) else relative
     return section | {
         "ate_rmse_m": trajectory_errors.ate_rmse_m(after),
@@ -221,7 +222,9 @@ def _joint_error(team: TeamError | Absent, robot: str) -> float | Absent:
 
 def _team_section(run: RunFolder, truth: TruePaths) -> dict[str, Any]:
     solo: list[float | Absent] = [
-        p if isinstance(p, Absent) else trajectory_errors.ate_rmse_m(p) for p in truth.after.values()
+        p if isinstance(p, Absent) else trajectory_errors.ate_rmse_m(p)
+        for name, p in truth.after.items()
+        if submap_of(name) is None  # the largest component stands for its robot
     ]
     missing = [s for s in solo if isinstance(s, Absent)]
     return {

@@ -65,13 +65,30 @@ def ate_rmse_m(pairs: Paired) -> float | Absent:
     return float(np.sqrt(np.mean(squared_errors_m2(pairs, T_gt_frame))))
 
 
-def rpe(pairs: Paired) -> tuple[float, float] | Absent:
-    """Relative pose error from frame to frame: RMSE of translation (m) and of rotation (rad)."""
+def rpe(pairs: Paired, log_stamps_ns: NDArray[np.int64]) -> tuple[float, float] | Absent:
+    """Relative pose error from frame to frame of the log: RMSE of translation (m) and of rotation (rad).
+
+    A step across frames that are lost or have no ground truth counts nowhere.
+
+    Args:
+        pairs: of one robot.
+        log_stamps_ns: of all frames of its log, int64 [n], in their order.
+    """
     if len(pairs) < 2:
         return Absent(f"relative errors need at least 2 paired poses, found {len(pairs)}")
     if pairs.positions_only:
         return NO_ROTATIONS
-    return rpe_rmse(pairs.true, pairs.estimated, step=1)
+    place = np.searchsorted(log_stamps_ns, pairs.stamps_ns)
+    stretches = np.split(np.arange(len(pairs)), 1 + np.flatnonzero(np.diff(place) != 1))
+    stretches = [rows for rows in stretches if len(rows) > 1]
+    if not stretches:
+        return Absent("no two consecutive frames of the log are paired with ground truth")
+    errors = [rpe_rmse(pairs.true[rows], pairs.estimated[rows], step=1) for rows in stretches]
+    if len(errors) == 1:
+        return errors[0]
+    steps = np.array([len(rows) - 1 for rows in stretches])
+    translation, rotation = np.sqrt(np.average(np.square(errors), axis=0, weights=steps)).tolist()
+    return translation, rotation
 
 
 @dataclass(frozen=True)

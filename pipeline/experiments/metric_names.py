@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 
+from duagc.pipeline.base.component_names import submap_of
 from duagc.pipeline.base.errors import DuagError, closest
 
 _ROBOT = (
@@ -104,7 +105,7 @@ def needs_surface(name: str) -> bool:
 
 
 def names_in(name: str, numbers: Mapping[str, object]) -> list[str]:
-    """The names that a metric stands for in the numbers of a run.
+    """The names that a metric stands for in the numbers of a run: the largest component of a robot is the robot.
 
     Args:
         name: of the metric, perhaps with `robots.*`.
@@ -113,8 +114,9 @@ def names_in(name: str, numbers: Mapping[str, object]) -> list[str]:
     if "*" not in name:
         return [name] if name in numbers else []
     head, tail = name.split("*")
-    return [
-        found
+    stands_for = {
+        found: found[len(head) : -len(tail)]
         for found in numbers
-        if found.startswith(head) and found.endswith(tail) and "." not in found[len(head) : -len(tail)]
-    ]
+        if found.startswith(head) and found.endswith(tail)
+    }
+    return [found for found, robot in stands_for.items() if "." not in robot and submap_of(robot) is None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.report import labels
 
@@ -41,7 +42,7 @@ def cards(metrics: dict[str, Any], reasons: dict[str, list[str]]) -> list[dict[s
         ("exchange.bytes_sent", *labels.EXCHANGE["bytes_sent"]),
         ("exchange.rounds", *labels.EXCHANGE["rounds"]),
     )
-    alone = len(metrics["robots"]) < 2
+    alone = len({robot_of(name) for name in metrics["robots"]}) < 2
     shown = []
     for path, label, what in chosen:
         value: Any = metrics

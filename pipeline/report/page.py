@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from duagc.pipeline.base.component_names import robot_of, submap_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from duagc.pipeline.base.templates import filled
@@ -75,7 +76,7 @@ def content(run: RunFolder, source: Recording, workers: int) -> dict[str, Any]:
     session = Session(run)
     shown_views, deviation_views = rendered_views(run, source, workers)
     return {
-        "title": f"{source.name}: {_count(len(run.robots), 'robot')}",
+        "title": f"{source.name}: {_count(len({robot_of(name) for name in run.robots}), 'robot')}",
         "subtitle": _subtitle(metrics),
         "sections": SECTIONS,
         "cards": cards(metrics, reasons),
@@ -148,8 +149,9 @@ def _count(number: int, noun: str) -> str:
 
 
 def _subtitle(metrics: dict[str, Any]) -> str:
-    team, robots = metrics["team"], metrics["robots"]
-    frames = sum(robot["frames"] for robot in robots.values())
+    team = metrics["team"]
+    robots = {name: row for name, row in metrics["robots"].items() if submap_of(name) is None}
+    frames = sum(robot["frames"] for robot in robots.values())  # every component has all frames of its log
     agree = team["robots_in_largest_component"]
     shared = (
         "no two robots share a world" if agree < 2 else f"{agree} of {team['robots']} robots share one world"

@@ -9,6 +9,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from duagc.pipeline import existing_run, runner
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.batch import results
 from duagc.pipeline.batch.batch import run_batch, status_text
@@ -17,6 +18,7 @@ from duagc.pipeline.batch.engines import LocalEngine
 from duagc.pipeline.batch.results import gather, paired
 from duagc.pipeline.batch.suite import Suite, read_suite
 from duagc.pipeline.cache.claims import this_process
+from duagc.pipeline.cache.file_digests import FileDigests
 from tests.fixtures import fake_run
 from tests.fixtures.commands import assert_one_line, duagc_here
 
@@ -189,6 +191,33 @@ def test_results_are_one_table_and_one_page_with_paired_differences(suite: Suite
     assert "20.00" in text
     assert '15.00<small class="worse">+5.00</small>' in text
     assert "out of &lt;memory&gt;" in text
+
+
+def test_frames_of_a_log_count_once_however_many_components_it_has(tmp_path: Path) -> None:
+    pretend_run(tmp_path, "one", 0.01)
+    run = run_folder(tmp_path, "one")
+    robots = {name: {"frames": 50, "ate_rmse_m": 0.1} for name in ("alpha", "alpha-2")}
+    (run / "metrics.json").write_text(json.dumps({"robots": robots}))
+    row = {"wall_s": 2.0, "cpu_s": 3.0, "peak_rss_mb": 100.0, "parts": {"tracking_s": 1.0, "mapping_s": 2.0}}
+    (run / "timing.json").write_text(json.dumps({"stages": {"frontend.alpha": row}}))
+    assert results.numbers_of(run)["time.tracking_ms_per_frame"] == 20.0
+
+
+def test_a_run_that_was_measured_otherwise_is_not_up_to_date(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, again = "wall-plain-0", []
+    pretend_run(tmp_path, name, 0.01)
+    run = run_folder(tmp_path, name)
+    named = {"metrics.json": vars(FileDigests(None).of(run / "metrics.json"))}
+    (run / "manifest.json").write_text(json.dumps({"stages": {"evaluation": {"files": named}}}))
+    monkeypatch.setattr(existing_run, "is_up_to_date", lambda *of, **settings: True)
+    monkeypatch.setattr(runner, "run", lambda *of, **settings: again.append(settings["force"]))
+    assert run_cell(suite.path, tmp_path, name, tmp_path / "store") == ""
+    assert again == []
+    (run / "metrics.json").write_text("{}")
+    assert run_cell(suite.path, tmp_path, name, tmp_path / "store") == ""
+    assert again == [True]
 
 
 def test_engines_have_names(suite: Suite, tmp_path: Path) -> None:

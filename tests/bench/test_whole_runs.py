@@ -34,6 +34,8 @@ team = dict(robots_in_largest_component=len(robots), ate_rmse_m=None)
 robot = dict(frames=5, keyframes=2, gaussians=7)
 exchange = dict(bytes_sent=3_000_000)
 metrics = dict(rendering=dict(own=own), team=team, exchange=exchange, robots={{r: robot for r in robots}})
+if "--split" in sys.argv:
+    metrics["robots"]["alpha-2"] = robot
 json.dump(metrics, open(out + "/metrics.json", "w"))
 """
 
@@ -115,6 +117,16 @@ def test_length_says_what_a_further_second_costs(
     assert [row["sent_mb"] for row in result["rows"]] == [3.0, 3.0]
     with pytest.raises(DuagError, match=r"shortest log has 0\.3 s, expected 9 s or more"):
         length.run(length.LengthPlan(recording.path, (9.0,)))
+
+
+def test_frames_and_time_of_a_robot_in_two_components_count_once(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(length, "THIS", (str(command(tmp_path, 3.0)),))
+    plan = length.LengthPlan(recording.path, (0.1,), threads=1, options=("--split",))
+    (row,) = length.run(plan)["rows"]
+    assert (row["frames"], row["cpu_s"], row["tracking_ms"]) == (10, 3.5, 20.0)
+    assert (row["keyframes"], row["gaussians"]) == (6, 21)
 
 
 def test_what_is_kept_is_completed(

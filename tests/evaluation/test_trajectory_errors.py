@@ -5,7 +5,7 @@ from duagc.pipeline.evaluation import trajectory_errors
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import Paired
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.geometry.trajectory import Trajectory, rpe_rmse
 
 
 def curved_path(n: int = 50, seed: int = 0) -> np.ndarray:
@@ -26,16 +26,33 @@ def test_errors_do_not_see_the_choice_of_frame():
     pairs = trajectory_errors.pair(Trajectory(STAMPS, path), Trajectory(STAMPS, T @ path))
     assert len(pairs) == 50
     assert trajectory_errors.ate_rmse_m(pairs) < 1e-12
-    assert trajectory_errors.rpe(pairs) == pytest.approx((0.0, 0.0), abs=1e-7)  # arccos near one
+    assert trajectory_errors.rpe(pairs, STAMPS) == pytest.approx((0.0, 0.0), abs=1e-7)  # arccos near one
 
 
 def test_rpe_sees_a_known_wrong_step():
     path = curved_path()
     wrong = path.copy()
     wrong[25:] = path[24] @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0])) @ se3.inverse(path[24]) @ path[25:]
-    trans, rot = trajectory_errors.rpe(Paired(STAMPS, path, wrong))
+    trans, rot = trajectory_errors.rpe(Paired(STAMPS, path, wrong), STAMPS)
     assert trans == pytest.approx(0.1 / np.sqrt(49))
     assert rot == pytest.approx(0.0, abs=1e-7)
+
+
+def test_steps_across_missing_frames_count_nowhere():
+    path = curved_path()
+    wrong = path.copy()
+    wrong[25:] = path[24] @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0])) @ se3.inverse(path[24]) @ path[25:]
+
+    def without(*missing):
+        kept = np.array([k for k in range(50) if k not in missing])
+        return trajectory_errors.rpe(Paired(STAMPS[kept], path[kept], wrong[kept]), STAMPS)
+
+    assert without(24, 25, 26) == pytest.approx((0.0, 0.0), abs=1e-7)
+    assert without(10) == pytest.approx((0.1 / np.sqrt(47), 0.0), abs=1e-7)
+    assert without(*range(40, 50)) == rpe_rmse(path[:40], wrong[:40])
+    answer = without(*range(0, 50, 2))
+    assert isinstance(answer, Absent)
+    assert "no two consecutive frames" in answer.reason
 
 
 def test_frames_without_ground_truth_are_left_out():
@@ -83,5 +100,5 @@ def test_a_team_of_one_has_no_joint_error():
 def test_true_positions_without_rotations_say_nothing_about_steps() -> None:
     path = se3.exp(np.random.default_rng(3).normal(0, 0.3, (len(STAMPS), 6)))
     pairs = Paired(STAMPS, path, path, positions_only=True)
-    assert isinstance(trajectory_errors.rpe(pairs), Absent)
+    assert isinstance(trajectory_errors.rpe(pairs, STAMPS), Absent)
     assert trajectory_errors.ate_rmse_m(pairs) == pytest.approx(0.0, abs=1e-9)

@@ -140,3 +140,12 @@ def test_the_command_writes_an_export_and_replaces_nothing_else(fake, tmp_path: 
             ["export", str(fake.run), "--out", str(tmp_path / "other"), "--force"],
             catch_exceptions=False,
         )
+
+
+def test_an_opacity_without_points_is_refused(fake, tmp_path):
+    words = ["export", str(fake.run), "--out", str(tmp_path / "out"), "--min-opacity", "0.5"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 2
+    assert "expected together with --points" in result.output
+    assert not (tmp_path / "out").exists()
+    assert CliRunner().invoke(app, [*words, "--points"]).exit_code == 0
