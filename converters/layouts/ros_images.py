@@ -136,8 +136,8 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
     if hasattr(message, "format"):
         data = bytes(message.data)
         pattern = message.format.split(";")[0].strip()
-        if pattern.startswith("bayer_"):
-            return _bayer_as_png(data, pattern, where), "png"
+        if pattern.startswith("bayer_") and (colors := _bayer_as_png(data, pattern, where)) is not None:
+            return colors, "png"
         if data.startswith(b"\xff\xd8\xff"):
             return data, "jpeg"
         if data.startswith(b"\x89PNG"):
@@ -166,20 +166,19 @@ def _is_webp(data: bytes) -> bool:
     return data.startswith(b"RIFF") and data[8:12] == b"WEBP"
 
 
-def _bayer_as_png(data: bytes, pattern: str, where: str) -> bytes:
-    """The colors of a compressed mosaic, as PNG; one that is compressed in color is none any more."""
+def _bayer_as_png(data: bytes, pattern: str, where: str) -> bytes | None:
+    """The colors of a compressed mosaic, as PNG; None for one that had colors before it was compressed."""
     import cv2
 
     image = decode_image(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None or image.dtype != np.uint8:
+    if image is not None and image.ndim == 3:
+        return None
+    if image is None or image.dtype != np.uint8 or pattern not in _COLOR_CODES:
         found = "no image" if image is None else str(image.dtype)
-        raise DuagError(f"{where}: {found} of {pattern}, expected a JPEG or PNG of 8 bits")
-    if image.ndim == 2:
-        if pattern not in _COLOR_CODES:
-            known = ", ".join(name for name in _COLOR_CODES if name.startswith("bayer_"))
-            raise DuagError(f"{where}: compressed {pattern}, expected one of {known}")
-        image = cv2.cvtColor(image, getattr(cv2, str(_COLOR_CODES[pattern][1])))
-    return cv2.imencode(".png", image[..., :3], [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
+        known = ", ".join(name for name in _COLOR_CODES if name.startswith("bayer_"))
+        raise DuagError(f"{where}: {found} of {pattern}, expected a JPEG or PNG of one of {known}")
+    colors = cv2.cvtColor(image, getattr(cv2, str(_COLOR_CODES[pattern][1])))
+    return cv2.imencode(".png", colors, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
 
 
 def _webp_as_png(data: bytes, where: str) -> bytes:

@@ -223,6 +223,12 @@ def test_a_compressed_mosaic_has_colors(pattern: str, kind: str) -> None:
     assert max(blue, green) < 10
 
 
+def test_colors_of_a_mosaic_that_were_compressed_stay_as_they_are() -> None:
+    data = cv2.imencode(".jpg", np.full((16, 24, 3), (10, 90, 200), np.uint8))[1].tobytes()
+    message = Fields(format="bayer_rggb8; jpeg compressed bgr8", data=data)
+    assert ros_images.color_bytes(message, "here") == (data, "jpeg")
+
+
 def test_a_compressed_mosaic_that_is_not_known_is_refused() -> None:
     data = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
     for pattern, content in (("bayer_rggb16", data), ("bayer_rggb8", b"\xff\xd8\xff")):
