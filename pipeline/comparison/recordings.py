@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_bytes
+from duagc.pipeline.base.ply_points import read_points
 from duagc.pipeline.comparison.fields import unequal
 from duagc.pipeline.recording import RECORDING_FILE, Recording
 
 MADE_BY = ("source", "converter", "parameters", "options_file")
 """Fields that explain differences, and are none."""
-PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4", "uint": "<u4"}
 
 
 def files_of(recording: Path) -> list[str]:
@@ -54,21 +52,16 @@ def made_otherwise(first: Path, second: Path) -> list[str]:
 
 
 def points_of(path: Path) -> dict[str, Any]:
-    """Values of the vertices of a binary .ply, by property; of a .ply of another kind its bytes.
+    """Values of the points of a .ply, by property; of a .ply of another kind its bytes.
 
     Args:
         path: of the file.
     """
-    data = read_bytes(path, "the geometry of a scene")
-    head, _, body = data.partition(b"end_header\n")
-    rows = re.findall(r"^property (\w+) (\w+)$", head.decode("ascii", errors="replace"), re.MULTILINE)
-    if not rows or any(kind not in PLY_TYPES for kind, _ in rows) or b"binary_little_endian" not in head:
-        return {"bytes": data}
-    row = np.dtype([(name, PLY_TYPES[kind]) for kind, name in rows])
-    if len(body) % row.itemsize or head.count(b"\nelement ") != 1:
-        return {"bytes": data}
-    vertices = np.frombuffer(body, dtype=row)
-    return {name: vertices[name] for _, name in rows}
+    try:
+        points = read_points(path)
+    except DuagError:
+        return {"bytes": read_bytes(path, "the geometry of a scene")}
+    return {name: points[name] for name in points.dtype.names or ()}
 
 
 def _without(row: Any, *names: str) -> Any:

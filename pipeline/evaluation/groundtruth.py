@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.ply_points import read_points
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import unpack_depth, unpack_mask, unpack_pose_in_frame
@@ -96,7 +97,6 @@ def _depth_scale(path: Path, topic: str) -> float:
 
 
 NEIGHBORS = 8
-PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4", "uint": "<u4"}
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def surface(recording: Recording) -> Surface | Absent:
     path = recording.geometry()
     if path is None:
         return Absent("the recording has no geometry of the scene (groundtruth.ply)")
-    rows = _read_points(path)
+    rows = read_points(path)
     normals = np.stack([rows[name] for name in ("nx", "ny", "nz")], axis=1).astype(np.float64)
     points = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -179,25 +179,3 @@ def check(recording: Recording) -> None:
         if path is not None:
             verify(path)
     surface(recording)
-
-
-def _read_points(path: Path) -> NDArray[np.void]:
-    """Vertices of a binary little-endian .ply whose only element is `vertex`, by name of the property."""
-    data = path.read_bytes()
-    head, mark, body = data.partition(b"end_header\n")
-    lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
-    lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
-    if not mark or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
-        raise DuagError(f"{path}: not a binary little-endian .ply, expected points with normals")
-    elements = [words[1:] for words in lines if words[0] == "element"]
-    properties = [words[1:] for words in lines if words[0] == "property"]
-    if len(elements) != 1 or elements[0][0] != "vertex" or not elements[0][-1].isdigit():
-        raise DuagError(f"{path}: has elements {elements}, expected only 'vertex N'")
-    missing = {"x", "y", "z", "nx", "ny", "nz"} - {words[-1] for words in properties}
-    if missing or any(words[0] not in PLY_TYPES for words in properties):
-        raise DuagError(f"{path}: has properties {properties}, expected scalars with x, y, z, nx, ny, nz")
-    row = np.dtype([(words[-1], PLY_TYPES[words[0]]) for words in properties])
-    expected = int(elements[0][-1]) * row.itemsize
-    if len(body) != expected:
-        raise DuagError(f"{path}: {len(body)} bytes of vertices, expected {expected}")
-    return np.frombuffer(body, dtype=row)

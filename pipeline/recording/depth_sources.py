@@ -72,8 +72,7 @@ class Registered:
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
         self.topic, self.camera = topic_table.DEPTH.of(robot), camera
         self.scale = _meters(log, self.topic, DEPTH_SCALE_KEY)
-        color_topic = topic_table.COLOR.of(robot)
-        self._steps = _Steps(log, self.topic, self.scale, camera, color_topic=color_topic)
+        self._steps = _Steps(log, self.topic, self.scale, camera, robot=robot)
         self._log, self._sigma_topic = log, topic_table.DEPTH_SIGMA.of(robot)
         self._sigma_at = log.entries_by_time(self._sigma_topic)
         if self._sigma_at:
@@ -103,8 +102,7 @@ class OtherCamera:
         self.depth_camera = constant(log, calibration, messages.unpack_calibration)
         transform = topic_table.RAW_DEPTH_TRANSFORM.of(robot)
         self.T_camera_depth = np.array(constant(log, transform, transform_rows))
-        color_topic = topic_table.COLOR.of(robot)
-        self._steps = _Steps(log, self.topic, self.scale, self.depth_camera, color_topic=color_topic)
+        self._steps = _Steps(log, self.topic, self.scale, self.depth_camera, robot=robot)
 
     def read(self, record: Record) -> DepthImage:
         depth_m = self._steps.smoothed(_depth_image(record, self.scale, self.depth_camera))
@@ -133,10 +131,8 @@ class Lidar:
 class _Steps:
     """Takes the steps out of the depth images of a topic, where they are coarse; found in some of its images."""
 
-    def __init__(
-        self, log: LogFile, topic: str, scale: float, camera: PinholeCamera, *, color_topic: str
-    ) -> None:
-        self._log, self._topic, self._color_topic = log, topic, color_topic
+    def __init__(self, log: LogFile, topic: str, scale: float, camera: PinholeCamera, *, robot: str) -> None:
+        self._log, self._topic, self._color_topic = log, topic, topic_table.COLOR.of(robot)
         self._scale, self._camera = scale, camera
 
     @cached_property

@@ -102,7 +102,7 @@ def test_images_of_held_out_frames_say_nothing_of_steps(
 
     class Log:
         def entries_by_time(self, topic: str) -> dict[int, int]:
-            return {k: k for k in range(images) if topic == "color" or k not in dropped}
+            return {k: k for k in range(images) if topic == "/alpha/camera/color" or k not in dropped}
 
         def record_at(self, _topic: str, entry: int) -> int:
             looked_at.append(entry)
@@ -111,7 +111,7 @@ def test_images_of_held_out_frames_say_nothing_of_steps(
     monkeypatch.setattr(depth_sources, "_depth_image", lambda *_: np.ones((4, 4), np.float32))
     camera = PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5)
     monkeypatch.setattr(depth_sources, "pair", lambda color, depth: pair(color, depth, 0))
-    steps = depth_sources._Steps(Log(), "depth", 0.001, camera, color_topic="color")
+    steps = depth_sources._Steps(Log(), "depth", 0.001, camera, robot="alpha")
     steps.smoothed(np.ones((4, 4), np.float32))
     mapped = [k for k in range(images) if k % 8 != 4 and k not in dropped]
     assert len(looked_at) == min(depth_sources.STEP_IMAGES, len(mapped))
