@@ -32,6 +32,9 @@ class CompiledAdam(Adam):
         values = [getattr(gaussians, name) for name in names]
         for name, value in zip(names, values, strict=True):
             _check_gradient(name, getattr(gradients, name), value.shape)
+            for moments in (self._first[name], self._second[name]):
+                _check_state(moments, np.float32)
+        _check_state(self._steps, np.int32)
         out = [empty(*value.shape) for value in values]
         arrays = (
             values,
@@ -71,6 +74,15 @@ class CompiledAdam(Adam):
         for name in first:
             self._first[name][rows], self._second[name][rows] = first[name], second[name]
         self._steps[rows] = steps
+
+
+def _check_state(array: NDArray[np.generic], dtype: type[np.generic]) -> None:
+    """Refuse a state that the kernel would change in a copy."""
+    if array.dtype != dtype or not array.flags.c_contiguous:
+        raise ValueError(
+            f"the state of the optimizer is {array.dtype} with strides {array.strides}, "
+            f"expected contiguous {np.dtype(dtype)}"
+        )
 
 
 def _check_gradient(name: str, gradient: object, shape: tuple[int, ...]) -> None:

@@ -13,7 +13,7 @@ Image = NDArray[np.float32]
 ROUNDS = 3  # of looking up where in the depth image a pixel was; each brings it nearer by the share that depth changes
 MOST_OFF_PX = 0.7  # of a found point from its pixel
 SAME_SURFACE = np.float32(0.03)  # relative step of depth up to which neighbors are one surface
-FARTHEST_PX = np.float32(1e4)
+FARTHEST_PX = np.float32(1e5)
 NEAREST_PLANE_M, NEAREST_FRONT_M = np.float32(1e-3), np.float32(0.05)
 
 

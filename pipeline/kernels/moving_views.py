@@ -18,6 +18,7 @@ from duagc.pipeline.config.training import DepthKind, LossConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.open_shutter import mean_color, mean_color_slope
+from duagc.pipeline.kernels.arguments import NEGATIVE, NOT_FINITE, checked_image
 from duagc.pipeline.kernels.rasterizer import Rasterizer
 from duagc.pipeline.kernels.types import Gradients, LossWeights, Render, ViewLoss
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -96,9 +97,10 @@ class MovingViews:
             depth_certainty: factor of the depth residuals; None: all 1.
             depth_kind: depth of a Gaussian at a pixel.
             pose: also differentiate by the right tangent of T_map_camera.
-            parameters: False: no derivative at all.
+            parameters: False: the derivative of the pose alone, or none at all.
         Raises:
             DuagError: the loss has the term of surfaces.
+            ValueError: an image of a wrong type, shape or value; the message names it.
         """
         if loss.surface_weight:
             raise DuagError(
@@ -112,6 +114,7 @@ class MovingViews:
             rasterizer.forward(gaussians, camera, se3.inverse(T), depth_kind=depth_kind, mask=mask)
             for rasterizer, T in zip(self._rasterizers, T_map_camera @ T_camera_moment, strict=False)
         ]
+        _check_images(color, depth_m, depth_certainty, camera)
         seen = _seen(drawn)
         weights = LossConfig(
             color_huber=loss.color_huber,
@@ -121,14 +124,25 @@ class MovingViews:
         )
         found = rgbd_loss(seen, color, depth_m, weights, mask=mask, certainty=depth_certainty)
         value = ViewLoss(found.value, found.color, found.depth, found.d_exposure)
-        if not parameters:
+        if not parameters and not pose:
             return value, Gradients(None, None, None, None, None)
         parts = []
         for k, (rasterizer, render) in enumerate(zip(self._rasterizers, drawn, strict=False)):
             slope: Image = found.d_color * mean_color_slope(render.color, seen.color, len(drawn))
             of_depth = (found.d_depth, found.d_alpha) if k == len(drawn) // 2 else (None, None)
-            parts.append(rasterizer.backward(slope, *of_depth, pose=pose))
+            parts.append(rasterizer.backward(slope, *of_depth, pose=pose, parameters=parameters))
         return value, _summed(parts, T_camera_moment)
+
+
+def _check_images(color: object, depth_m: object, certainty: object, camera: PinholeCamera) -> None:
+    """Refuse what `Rasterizer.view_gradients` refuses."""
+    size = (camera.height, camera.width)
+    if not np.isfinite(checked_image("color", color, (*size, 3), "the camera")).all():
+        raise ValueError(f"color holds {NOT_FINITE}")
+    for name, image in (("depth_m", depth_m), ("depth_certainty", certainty)):
+        found = np.zeros(1) if image is None else checked_image(name, image, size, "the camera")
+        if not (np.isfinite(found) & (found >= 0)).all():
+            raise ValueError(f"{name} holds {NEGATIVE}")
 
 
 def _summed(parts: Sequence[Gradients], T_camera_moment: Array) -> Gradients:
@@ -136,7 +150,8 @@ def _summed(parts: Sequence[Gradients], T_camera_moment: Array) -> Gradients:
     total: dict[str, Any] = {name: getattr(parts[0], name) for name in TRAINED}
     for part in parts[1:]:
         for name in TRAINED:
-            total[name] += getattr(part, name)
+            if total[name] is not None:
+                total[name] += getattr(part, name)
     if parts[0].pose is None:
         return Gradients(**total)
     # T_map_camera exp(x) T = T_map_camera T exp(Ad(T^-1) x)

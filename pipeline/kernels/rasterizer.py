@@ -54,6 +54,12 @@ _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)
 
 
+def _checked_threads(threads: object) -> int:
+    if not isinstance(threads, SupportsIndex) or not 1 <= operator.index(threads) <= MAX_THREADS:
+        raise ValueError(f"threads is {threads!r}, expected a whole number from 1 to {MAX_THREADS}")
+    return operator.index(threads)
+
+
 def available_isas() -> list[str]:
     """Builds that this processor can run, fastest first: "avx512", "avx2", "neon", "portable"."""
     return list(_raster.available_isas())
@@ -78,8 +84,7 @@ class Rasterizer:
         """
         if not isinstance(isa, str) or isa not in ("auto", *available_isas()):
             raise ValueError(f"isa is {isa!r}, available here: auto, {', '.join(available_isas())}")
-        if not isinstance(threads, SupportsIndex) or not 1 <= operator.index(threads) <= MAX_THREADS:
-            raise ValueError(f"threads is {threads!r}, expected a whole number from 1 to {MAX_THREADS}")
+        _checked_threads(threads)
         self.threads = threads
         self._raster = _raster.Raster(isa)
         self._gaussians: Gaussians | None = None
@@ -121,11 +126,9 @@ class Rasterizer:
             gaussians, camera, T_camera_map, background=background, mask=mask, depth_kind=depth_kind
         )
         color, depths, alpha = empty(height, width, 3), empty(height, width), empty(height, width)
-        self._finish(
-            gaussians,
-            (height, width),
-            self._raster.forward(*arrays_of(gaussians), *view, color, depths, alpha),
-        )
+        self._gaussians = None  # whatever ends the call, nothing may follow on what is half drawn
+        status = self._raster.forward(*arrays_of(gaussians), *view, color, depths, alpha)
+        self._finish(gaussians, (height, width), status)
         return Render(color, depths, alpha)
 
     def view_gradients(
@@ -192,8 +195,8 @@ class Rasterizer:
         arguments = [*arrays_of(gaussians), *view, *measured, weights, values, *out, by_pose]
         if depth_certainty is not None:
             arguments.append(checked_image("depth_certainty", depth_certainty, (height, width), "the camera"))
-        status = self._raster.fit(*arguments)
         self._gaussians = None
+        status = self._raster.fit(*arguments)
         refuse_bad_image(status, {"color": NOT_FINITE, "depth_m": NEGATIVE, "depth_certainty": NEGATIVE})
         self._finish(gaussians, (height, width), status)
         self._closed_early = closing > TRANSMITTANCE_MIN
@@ -219,7 +222,7 @@ class Rasterizer:
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         wanted = _NO_MASK if mask is None else checked_mask(mask, (height, width))
-        ray_plane, threads = depth_kind == "ray_plane", operator.index(self.threads)
+        ray_plane, threads = depth_kind == "ray_plane", _checked_threads(self.threads)
         return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, threads)
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:

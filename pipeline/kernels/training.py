@@ -130,7 +130,7 @@ class TrainingStep:
             camera: of the view.
             view: an image with its pose.
             pose: also differentiate by the right tangent of the pose.
-            closing: as of `Rasterizer.view_gradients`.
+            closing: as of `Rasterizer.view_gradients`; a view of a moving camera is drawn whole.
             parameters: as of `Rasterizer.view_gradients`.
         """
         if view.T_camera_moment is not None:

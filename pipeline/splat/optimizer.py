@@ -21,7 +21,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 TRAINED = tuple(_SHAPES)
 """What is optimized of a Gaussian."""
 BETA_1, BETA_2, EPSILON = 0.9, 0.99, 1e-12
-_LONGEST = 1024  # steps after which both bias corrections are 1 within float32
+_LONGEST = 1024  # steps after which the bias corrections stay, at 1 - 2e-5
 
 
 class GaussianGradients(Protocol):

@@ -253,3 +253,10 @@ def test_outputs_outlive_their_rasterizer_and_are_never_shared():
         drawn(50)
     assert all(np.array_equal(image, wanted) for image in kept)
     np.testing.assert_array_equal(means[1], 2 * means[0])
+
+
+def test_threads_are_checked_at_every_call(plain):
+    rasterizer = Rasterizer()
+    rasterizer.threads = 0
+    with pytest.raises(ValueError, match="threads is 0"):
+        rasterizer.forward(plain.gaussians, plain.camera, plain.T_camera_map)

@@ -1,5 +1,7 @@
 """What must hold for any scene, whatever the implementation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -37,6 +39,33 @@ def test_any_small_scene_matches_the_reference(seed, n, size, spread):
     scale = max(np.linalg.norm(exact.means), 1e-3)
     assert np.linalg.norm(gradients.means - exact.means) < 1e-4 * scale
     assert np.linalg.norm(gradients.pose - exact.pose) < 1e-4 * max(np.linalg.norm(exact.pose), 1e-3)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("size", [(16, 17), (17, 16), (49, 33), (33, 49), (113, 20), (20, 81)])
+def test_the_last_row_and_column_of_an_image_of_any_size(size, threads):
+    """A tile that has one row or one column of pixels is drawn as the others."""
+    width, height = size
+    camera = PinholeCamera(width, height, 60.0, 60.0, width / 2 - 0.5, height / 2 - 0.5)
+    gaussians = random_gaussians(60, seed=3)
+    gaussians = gaussians.replace(log_scales=gaussians.log_scales + 0.7)
+    rasterizer = Rasterizer(threads=threads)
+    wanted = ReferenceRasterizer().forward(gaussians, camera, np.eye(4))
+    found = rasterizer.forward(gaussians, camera, np.eye(4))
+    assert wanted.alpha[-1].min() > 0.05
+    assert wanted.alpha[:, -1].min() > 0.05
+    np.testing.assert_allclose(found.alpha, wanted.alpha, atol=1e-4)
+
+
+def test_counts_do_not_depend_on_threads():
+    camera = PinholeCamera(64, 64, 60.0, 60.0, 31.5, 31.5)
+    gaussians = random_gaussians(20_000, seed=0)
+    counts = []
+    for threads in (1, 2, 3, 4):
+        rasterizer = Rasterizer(threads=threads)
+        rasterizer.forward(gaussians, camera, np.eye(4))
+        counts.append(replace(rasterizer.statistics(), scratch_bytes=0))
+    assert len(set(counts)) == 1
 
 
 def test_pose_gradient_is_by_the_right_tangent_of_the_camera_in_the_map(plain):

@@ -98,3 +98,20 @@ def test_a_term_of_single_gaussians_is_refused() -> None:
     training = TrainingStep(Rasterizer(), LossWeights(0.1, 1.0, 0.02, 0.04, surface_weight=0.5), "ray_plane")
     with pytest.raises(DuagError, match=r"surface_weight: 0\.5, expected 0"):
         training.loss_of(LARGE, SCENE.camera, a_view())
+
+
+def test_the_pose_alone_and_with_all_others_is_the_same() -> None:
+    view, training = a_view(), step()
+    _, both = training.gradients(LARGE, SCENE.camera, view, pose=True)
+    _, alone = training.gradients(LARGE, SCENE.camera, view, pose=True, parameters=False)
+    assert alone.means is None
+    np.testing.assert_array_equal(alone.pose, both.pose)
+
+
+@pytest.mark.parametrize(("name", "value"), [("color", np.nan), ("depth_m", -1.0)])
+def test_images_that_no_camera_gives_are_refused(name: str, value: float) -> None:
+    view = a_view()
+    image = getattr(view, name).copy()
+    image.flat[7] = value
+    with pytest.raises(ValueError, match=f"{name} holds"):
+        step().gradients(LARGE, SCENE.camera, replace(view, **{name: image}))

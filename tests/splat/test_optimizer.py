@@ -161,3 +161,10 @@ def test_rates_fall_from_one_to_the_last_and_never_rise() -> None:
     assert shares[50] == pytest.approx((1.0 + 0.03) / 2)
     assert (np.diff(shares) < 0).all()
     assert smoothstep_decay(0, 1, 0.03) == 1.0
+
+
+def test_a_state_that_would_be_changed_in_a_copy_is_refused() -> None:
+    gaussians, adam = some(6), CompiledAdam(6)
+    every_second = adam.part(slice(None, None, 2))
+    with pytest.raises(ValueError, match="expected contiguous"):
+        every_second.step(gaussians.select(slice(None, None, 2)), gradients(3, 0), LearningRates())

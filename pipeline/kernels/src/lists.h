@@ -53,7 +53,7 @@ inline void find_wanted_blocks(Frame& frame, const Band& band) {
 struct Window {
     uint32_t member;
     uint16_t tile_x, tile_y;
-    bool wide, opens;  // opens: first window of its member
+    bool wide, opens, ends;  // opens: first window of its member; ends: the member has no row below the first
 };
 constexpr size_t GAUSSIANS_AHEAD = 96, RECORDS_AHEAD = 64;  // to prefetch: what memory takes to answer
 constexpr int WINDOWS_IN_STEP = 4;
@@ -116,7 +116,7 @@ inline void test_windows(Frame& frame, Band& band, const Window* windows, int co
         for (int i = 0; i < WINDOWS_IN_STEP && first + i < count; i++) {
             const Window w = windows[first + i];
             const uint16_t* wanted_first = wanted + w.tile_y * stride + w.tile_x;
-            const uint16_t* wanted_below = w.tile_y < last_row ? wanted_first + stride : nothing;
+            const uint16_t* wanted_below = !w.ends && w.tile_y < last_row ? wanted_first + stride : nothing;
             const Words8 found = masked(touched[i], wanted_first, w.wide ? wanted_first + 4 : wanted_below);
             const uint32_t tile = (w.tile_y - first_row) * tiles_x + w.tile_x, to_second_four = w.wide ? 4 : tiles_x;
             opened = w.opens ? total : opened;
@@ -160,8 +160,8 @@ inline void find_records(Frame& frame, Band& band) {
         const int height = bottom - top + 1, width = columns.last - columns.first + 1;
         if (0 < height && height <= 4 && 0 < width && width <= 4) {  // nearly all: one window or two
             const uint16_t x = static_cast<uint16_t>(columns.first), y = static_cast<uint16_t>(top);
-            windows[waiting] = {member, x, y, false, true};
-            windows[waiting + 1] = {member, x, static_cast<uint16_t>(y + 2), false, false};
+            windows[waiting] = {member, x, y, false, true, height == 1};
+            windows[waiting + 1] = {member, x, static_cast<uint16_t>(y + 2), false, false, height == 3};
             waiting += 1 + (height > 2);
         } else {
             ranges[member] = {0, 0};  // should it lie between two pixels
@@ -169,7 +169,8 @@ inline void find_records(Frame& frame, Band& band) {
             bool opens = true;
             for (int y = top; y <= bottom; y += wide ? 1 : 2)
                 for (int x = columns.first; x <= columns.last; x += wide ? 8 : 4) {
-                    windows[waiting++] = {member, static_cast<uint16_t>(x), static_cast<uint16_t>(y), wide, opens};
+                    const auto column = static_cast<uint16_t>(x), row = static_cast<uint16_t>(y);
+                    windows[waiting++] = {member, column, row, wide, opens, y == bottom};
                     opens = false;
                     if (waiting >= WINDOWS) test(waiting), waiting = 0;
                 }

@@ -24,6 +24,7 @@ public:
         for (size_t i = 0; i < free_.size(); i++)
             if (free_[i].capacity == capacity) {
                 float* memory = free_[i].memory;
+                kept_ -= capacity;
                 free_.erase(free_.begin() + static_cast<std::ptrdiff_t>(i));
                 return memory;
             }
@@ -32,7 +33,9 @@ public:
     void give_back(float* memory, size_t capacity) {
         const std::lock_guard<std::mutex> lock(mutex_);
         free_.push_back({memory, capacity});
-        if (free_.size() > KEPT) {
+        kept_ += capacity;
+        while (free_.size() > KEPT || kept_ > KEPT_FLOATS) {
+            kept_ -= free_.front().capacity;
             release_aligned(free_.front().memory);
             free_.erase(free_.begin());
         }
@@ -56,8 +59,9 @@ private:
         float* memory;
         size_t capacity;
     };
-    static constexpr size_t KEPT = 24;
+    static constexpr size_t KEPT = 24, KEPT_FLOATS = size_t{1} << 26;  // 256 MiB
     std::mutex mutex_;
+    size_t kept_ = 0;  // floats that nobody uses
     std::vector<Loan> free_;
 };
 

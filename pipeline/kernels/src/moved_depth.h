@@ -10,7 +10,7 @@ namespace KERNEL_ISA {
 
 using namespace raster;
 
-constexpr float FARTHEST_PIXEL = 1e4f;    // of a projection: beyond is outside of every image
+constexpr float FARTHEST_PIXEL = 1e5f;    // of a projection: beyond is outside of every image
 constexpr float NEAREST_PLANE_M = 1e-3f;  // nearer points are projected as if they were there
 
 // Of the pixels that are looked up together: rays (x, y, 1), inverse depth, and where in the depth image it is looked up.

@@ -117,11 +117,12 @@ struct TileRange {
     int first, last;
     explicit TileRange(uint32_t bits) : first(bits & 2047), last(bits >> 11 & 2047) {}
     static Vec pack(Vec first_pixel, Vec last_pixel, int pixels) {
-        const Vec zero(0.0f), edge(pixels - 1.0f), half(0.5f), per_tile(1.0f / TILE), shifter(12582912.0f);  // see exp2
-        const auto tile = [&](Vec pixel) {
-            return (fma(min(max(pixel, zero), edge), per_tile, -half) + shifter) - shifter;
+        const Vec zero(0.0f), edge(pixels - 1.0f), per_tile(1.0f / TILE), shifter(12582912.0f);  // see exp2
+        const auto tile = [&](Vec pixel, float down) {
+            return (fma(min(max(pixel, zero), edge), per_tile, Vec(down)) + shifter) - shifter;
         };
-        return fma(tile(last_pixel), Vec(2048.0f), tile(first_pixel)) + Vec(8388608.0f);  // 2^23
+        // halves are rounded to even: the first pixel of a tile must not be taken for the last one of the tile before
+        return fma(tile(last_pixel, -0.499f), Vec(2048.0f), tile(first_pixel, -0.5f)) + Vec(8388608.0f);  // 2^23
     }
 };
 
@@ -137,8 +138,9 @@ inline void footprint_columns(const View& view, const Splat16& s, Vec extent_x, 
     columns[3] = skew;
     columns[4] = quarter * (extent_x * skew);
     columns[5] = quarter * fma(extent_x, upright, rounding);
-    columns[6] = TileRange::pack(s.u - extent_x + one, s.u + extent_x, view.width);  // + 1: up, if only by part of a pixel
-    columns[7] = TileRange::pack(s.v - extent_y + one, s.v + extent_y, view.height);
+    const Vec right = extent_x + rounding, below = extent_y + rounding;
+    columns[6] = TileRange::pack(s.u - right + one, s.u + right, view.width);  // + 1: up, if only by part of a pixel
+    columns[7] = TileRange::pack(s.v - below + one, s.v + below, view.height);
 }
 
 // Writes the splats and footprints from `first` on, and the keys of those that are drawn; returns how many are.
