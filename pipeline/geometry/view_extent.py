@@ -49,9 +49,11 @@ class ViewExtent:
         from scipy import ndimage
 
         side = max(1, camera.width // BLOCKS)
-        height, width = depth_m.shape[0] // side, depth_m.shape[1] // side
-        known = np.where(depth_m > 0, depth_m, np.float32(np.inf))[: height * side, : width * side]
-        blocks = known.reshape(height, side, width, side).max(axis=(1, 3))
+        known = np.where(depth_m > 0, depth_m, np.float32(np.inf))
+        beyond = [(0, -length % side) for length in known.shape]  # of the last blocks, beyond the image
+        whole = np.pad(known, beyond, constant_values=np.float32(-np.inf))
+        height, width = whole.shape[0] // side, whole.shape[1] // side
+        blocks = whole.reshape(height, side, width, side).max(axis=(1, 3))
         near = depth_m[::8, ::8]
         median_m = float(np.median(near[near > 0])) if near.any() else 0.0
         center = np.array([0.0, 0.0, median_m])

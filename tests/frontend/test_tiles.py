@@ -10,6 +10,8 @@ from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping import Mapper
 from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_tile
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
 from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView
@@ -197,3 +199,16 @@ def test_guests_leave_room_for_what_a_tile_adds() -> None:
     assert (part.cap, part.room) == (guests + 80, 80)  # 200, all that views see
     free = part.take(np.arange(guests), none, uncounted=guests)
     assert (free.cap, free.room) == (guests + 100, 100)
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (752, 480), (640, 480), (4000, 60)])
+def test_the_last_rows_and_columns_of_any_image_count(size: tuple[int, int]) -> None:
+    """What lies far away in the last rows alone, below something near, is seen."""
+    width, height = size
+    camera = PinholeCamera(width, height, 500.0, 500.0, width / 2 - 0.5, height / 2 - 0.5)
+    depth_m = np.full((height, width), 1.0, np.float32)
+    depth_m[-4:] = 4.0
+    u = np.linspace(10, width - 10, 20)
+    last = back_project(camera, u, np.full(20, height - 2.0), np.full(20, 3.9)).astype(np.float32)
+    seen = ViewExtent.of(depth_m, camera).sees(last, np.full(20, 0.01, np.float32), np.eye(4))
+    assert seen.all()
