@@ -12,7 +12,7 @@ class InformationConfig(Config):
 
     window: Literal["all", "rolling", "per_gaussian"] = "all"
     """Keyframes that count: all; the last `window_length`; for each Gaussian the last `window_length` that saw it."""
-    window_length: int = 10
+    window_length: int = Field(default=10, ge=1)
     """Keyframes of the windows `rolling` and `per_gaussian`."""
     color_sigma_floor: float = 0.01
     """Least standard deviation of a color channel (0..1), whatever the residuals say."""

@@ -99,12 +99,13 @@ def own_views(
     """
     log.move_depth_by(frontend_path)
     final = front.final
-    beyond = [k.frame_index for k in front.keyframes if k.frame_index >= len(log)]
-    if beyond:
-        raise DuagError(
-            f"{frontend_path}: {topics.KEYFRAME.of(final.robot)} names frame {beyond[0]}, "
-            f"expected less than the {len(log)} frames of {log.path.name}"
-        )
+    named = ((topics.KEYFRAME, front.keyframes), (topics.ODOMETRY, front.others))
+    for topic, posed_frames in named:
+        if beyond := [k.frame_index for k in posed_frames if k.frame_index >= len(log)]:
+            raise DuagError(
+                f"{frontend_path}: {topic.of(final.robot)} names frame {beyond[0]}, "
+                f"expected less than the {len(log)} frames of {log.path.name}"
+            )
     exposures = read_exposures(frontend_path, final.robot)
 
     def posed(keyframe: Keyframe) -> PosedRgbd:

@@ -80,6 +80,12 @@ def read_ply(path: str | Path) -> Gaussians:
         raise DuagError(f"{path.name}: rot_0..3 has length {norms.min():.3g}..{norms.max():.3g}, expected 1")
     if len(table) and table[:, 10:13].max() > np.log(1e4):
         raise DuagError(f"{path.name}: scale_0..2 reach {table[:, 10:13].max():.3g}, expected log of meters")
+    opacity = table[:, 9]
+    if len(table) and table[:, 10:13].min() > 0 and opacity.min() >= 0 and opacity.max() <= 1:
+        raise DuagError(
+            f"{path.name}: scale_0..2 are {table[:, 10:13].min():.3g} or more and opacity is "
+            f"{opacity.min():.3g}..{opacity.max():.3g}, expected log of meters and logits: were they activated?"
+        )
     return Gaussians(
         ids=np.arange(len(table), dtype=np.int64),
         anchors=np.zeros(len(table), np.int32),

@@ -100,3 +100,15 @@ def test_activated_values_are_refused(tmp_path: Path) -> None:
     path.write_bytes(header + b"end_header\n" + table.tobytes())
     with pytest.raises(DuagError, match=r"rot_0\.\.3 has length"):
         read_ply(path)
+
+
+def test_exponentiated_scales_and_opacities_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.ply"
+    write_ply(path, some(3))
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    table = np.frombuffer(body, "<f4").reshape(-1, len(PROPERTIES)).copy()
+    table[:, 9] = 1 / (1 + np.exp(-table[:, 9]))
+    table[:, 10:13] = np.exp(table[:, 10:13])
+    path.write_bytes(header + b"end_header\n" + table.tobytes())
+    with pytest.raises(DuagError, match="were they activated"):
+        read_ply(path)
