@@ -43,6 +43,11 @@ BLOCKS_PER_SAMPLE = 30.0
 """Blocks that say together what one would say alone: neighbors share their errors."""
 SMOOTH = 0.02
 """Relative standard deviation of the inverse depth in a block up to which it shows one surface."""
+LEAST_WHOLE = 0.7
+"""Share of the blocks that show one surface of which every pixel has a depth; below, holes are scattered over the
+whole image, and pixels without depth are left out."""
+LEAST_KNOWN = 0.5
+"""Share of the pixels of a block that then have a depth."""
 MOST_ROWS = 16_384
 """Of an image that OpenCV is given: it takes less than 32,767."""
 ROUNDS_OF_PAIR = 8
@@ -60,7 +65,7 @@ class ColorBlocks:
     Attributes:
         camera: of the blocks.
         color: float32 [h, w, 3], 0..1; NaN where a pixel of the block is clipped or masked.
-        inverse_depth: float32 [h, w], 1/m; NaN where the block does not show one surface.
+        inverse_depth: float32 [h, w], 1/m; NaN where the block does not show one surface, or is not known.
     """
 
     camera: PinholeCamera
@@ -91,9 +96,13 @@ class ColorBlocks:
         depth_m = frame.usable_depth[rows, columns]
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = np.where(depth_m > 0, 1 / depth_m, np.float32(np.nan)).astype(np.float32)
-            middle = mean(inverse)
-            variance = mean(inverse * inverse) - middle * middle
-            middle = np.where(variance <= (SMOOTH * middle) ** 2, middle, np.float32(np.nan))
+            middle = _smooth(mean(inverse), mean(inverse * inverse))
+            known = mean((depth_m > 0).astype(np.float32))
+            known[known < LEAST_KNOWN] = np.nan
+            inverse[depth_m <= 0] = 0
+            without_holes = _smooth(mean(inverse) / known, mean(inverse * inverse) / known)
+            if np.count_nonzero(middle > 0) < LEAST_WHOLE * np.count_nonzero(without_holes > 0):
+                middle = without_holes
         scaled = PinholeCamera(
             width=width,
             height=height,
@@ -141,6 +150,12 @@ class ColorBlocks:
             same = np.abs(found[:, 3] * there[:, 2] - 1) < SAME_SURFACE
         same &= np.isfinite(found).all(axis=1)
         return self.color[v[same], u[same]].astype(np.float64), found[same, :3].astype(np.float64)
+
+
+def _smooth(mean: NDArray[np.float32], mean_square: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of inverse depth over blocks; NaN where a block does not show one surface."""
+    same = mean_square - mean * mean <= (SMOOTH * mean) ** 2
+    return np.where(same, mean, np.float32(np.nan))
 
 
 @dataclass(frozen=True)

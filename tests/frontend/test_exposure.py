@@ -1,5 +1,6 @@
 """Exposures of frames, found from what frames show of the same surfaces."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -239,3 +240,26 @@ def test_frames_are_compared_in_as_many_blocks_as_are_asked_for() -> None:
     own, other = blocks.shared_with(blocks, np.eye(4))
     assert len(own) > 70_000
     np.testing.assert_allclose(own, other, atol=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.04])
+def test_holes_all_over_the_depth_leave_the_gain(share: float) -> None:
+    """Stereo depth has scattered pixels without a value: in every block there are some."""
+    rng, gains = np.random.default_rng(1), wandering(13)
+    frames = []
+    for k in range(13):
+        f = frame(k, gains[k])
+        depth_m = np.where(rng.random(f.depth.shape) < share, np.float32(0), f.depth)
+        frames.append(RgbdFrame(k, f.stamp_ns, f.color, depth_m))
+    track = estimated(frames)
+    assert len(track.frame_index) == sum(not is_held_out(k) for k in range(13))
+    assert np.std(np.log(track.gain / gains[track.frame_index]), axis=0) == pytest.approx(0.0, abs=0.015)
+
+
+def test_depth_with_one_large_hole_is_read_as_before() -> None:
+    f = frame(0, np.ones(3))
+    half = f.depth.copy()
+    half[:, 80:] = 0
+    whole, blocks = ColorBlocks.of(f, CAMERA, 40), ColorBlocks.of(replace(f, depth=half), CAMERA, 40)
+    np.testing.assert_array_equal(blocks.inverse_depth[:, :20], whole.inverse_depth[:, :20])
+    assert np.isnan(blocks.inverse_depth[:, 20:]).all()
