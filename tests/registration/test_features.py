@@ -1,9 +1,12 @@
 """Features of the same place are found in bright images and in dark ones."""
 
+import cv2
 import numpy as np
+import pytest
 
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.registration.features import brightened, extract, matches
+from duagc.pipeline.registration import RgbdPyramid
+from duagc.pipeline.registration.features import brightened, extract, extract_from_pyramid, matches
 
 CAMERA = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5)
 DEPTH = np.full((120, 160), 2.0, np.float32)
@@ -37,3 +40,16 @@ def test_only_dark_images_are_brightened() -> None:
         dark = np.rint(share * blobs()).astype(np.uint8)
         np.testing.assert_array_equal(brightened(dark), np.minimum(dark.astype(int) * factor, 255))
     assert not brightened(np.zeros((12, 16), np.uint8)).any()
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "level"), [(640, 480, 1), (848, 480, 1), (424, 240, 0), (1280, 720, 2), (160, 120, 0)]
+)
+def test_features_come_from_an_image_of_240_to_425_columns(width: int, height: int, level: int) -> None:
+    gray = cv2.resize(blobs().astype(np.float32) / 255, (width, height), interpolation=cv2.INTER_CUBIC)
+    camera = PinholeCamera(width, height, width, width, width / 2 - 0.5, height / 2 - 0.5)
+    pyramid = RgbdPyramid.build(np.clip(gray, 0, 1), np.full((height, width), 2.0, np.float32), camera, 4)
+    found = extract_from_pyramid(pyramid, 400, 100)
+    alone = RgbdPyramid(pyramid.levels[level : level + 1])
+    np.testing.assert_array_equal(found.points, extract_from_pyramid(alone, 1000, 100).points)
+    assert len(found) > 20
