@@ -21,6 +21,7 @@ from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import unpack_depth, unpack_mask, unpack_pose_in_frame
 from duagc.pipeline.recording import DEPTH_SCALE_KEY, Recording, read_log, verify
+from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics
 
 
@@ -68,9 +69,18 @@ def static_masks(
 
 
 def recorded_depth_is_exact(recording: Recording, robot: str) -> bool:
-    """Whether recording.json says that the depth in the robot's log has no noise: a simulated sensor."""
+    """Whether the depth in the robot's log is the true one: a simulated sensor without noise.
+
+    Such depth may still be late, in steps or seen through a lens; then the ground truth has the exact depth apart.
+    """
     sensors = recording.description["robots"][robot_of(robot)].get("sensors") or {}
-    return sensors.get("depth_noise") == "none"
+    if sensors.get("depth_noise") != "none":
+        return False
+    path, topic = recording.groundtruth(robot), topics.GROUNDTRUTH_DEPTH.of(robot_of(robot))
+    if path is None:
+        return True
+    with LogFile(path) as log:
+        return topic not in log.channels
 
 
 def knows_rotations(recording: Recording, robot: str) -> bool:

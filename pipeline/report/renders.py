@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.evaluation.groundtruth import recorded_depth_is_exact
+from duagc.pipeline.evaluation.groundtruth import exact_depths, recorded_depth_is_exact
 from duagc.pipeline.evaluation.pixel_deviation import StatedMap, rendered_depth, stated_in_world
 from duagc.pipeline.evaluation.pixel_errors import stated_noise, true_depth
 from duagc.pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
@@ -92,7 +92,7 @@ def _views_of(run: RunFolder, source: Recording, name: str, number: int) -> tupl
                 stated_in_world(robot, final),
                 robot.trajectory,
                 log,
-                [_compared(frame, source, name) for frame in frames],
+                _compared(frames, source, name),
                 kind=kind,
                 noise=stated_noise(run.config.information),
                 rasterizer=rasterizer,
@@ -106,9 +106,13 @@ def _views_of(run: RunFolder, source: Recording, name: str, number: int) -> tupl
     return shown, deviations
 
 
-def _compared(frame: RgbdFrame, source: Recording, robot: str) -> ScoredFrame:
-    """A frame whose recorded depth the renders are compared with, and whether that has noise."""
-    return ScoredFrame(frame, frame.depth if recorded_depth_is_exact(source, robot) else NO_EXACT)
+def _compared(frames: Sequence[RgbdFrame], source: Recording, robot: str) -> list[ScoredFrame]:
+    """Frames with their exact depth, where there is some; the others' renders are compared with recorded depth."""
+    if recorded_depth_is_exact(source, robot):
+        return [ScoredFrame(frame, frame.depth) for frame in frames]
+    exact = exact_depths(source, robot, {frame.stamp_ns for frame in frames})
+    known = {} if isinstance(exact, Absent) else exact
+    return [ScoredFrame(frame, known.get(frame.stamp_ns, NO_EXACT)) for frame in frames]
 
 
 def _own_views(
@@ -245,16 +249,16 @@ def _deviation_view(
     noise: DepthNoise,
     rasterizer: Rasterizer,
 ) -> dict[str, Any]:
-    """Predicted and found differences of rendered and recorded depth at frames, on one scale."""
+    """Predicted and found differences of rendered and true depth at frames, on one scale."""
     poses, shown, ends = poses_by_stamp(path), [], [0.0]
     for view in frames:
         frame = view.frame
-        recorded_m, sensor_m = true_depth(view, noise)
+        true_m, sensor_m = true_depth(view, noise)
         rendered = rendered_depth(rasterizer, stated, log.camera, se3.inverse(poses[frame.stamp_ns]))
-        both = (recorded_m > 0) & (rendered.sigma_m > 0)
+        both = (true_m > 0) & (rendered.sigma_m > 0)
         predicted_m = np.hypot(rendered.sigma_m, sensor_m)
         ends.append(float(np.percentile(predicted_m[both], 95)) if both.any() else 0.0)
-        shown.append((frame, both, predicted_m, np.abs(rendered.depth_m - recorded_m)))
+        shown.append((frame, both, predicted_m, np.abs(rendered.depth_m - true_m)))
     end_m, columns = max(ends), list[tuple[str, NDArray[np.uint8]]]()
     for frame, both, *values_m in shown:
         predicted, found = (pictures.colored(v, 0.0, end_m, valid=both, palette="magma") for v in values_m)

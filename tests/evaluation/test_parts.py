@@ -19,6 +19,7 @@ from duagc.pipeline.evaluation.views import ComparedImage
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Render
 from duagc.pipeline.recording import LogWriter, Recording, open_rgbd
+from duagc.pipeline.report.renders import _compared
 from duagc.pipeline.runs.digest import digest_file
 from duagc.pipeline.runs.folder import RunFolder, position_information
 from duagc.pipeline.splat.information import sigma_along
@@ -92,6 +93,20 @@ def test_what_moves_by_the_truth_counts_in_no_view(tmp_path, monkeypatch):
         seen = [view.frame.mask for view in rendering.scored_frames(log, [0, 1], recording, robot)]
     assert seen[0] is None
     assert np.array_equal(seen[1], left)
+
+
+def test_depth_that_is_degraded_without_noise_is_not_the_truth(tmp_path):
+    made = make(tmp_path, depth_noise="kinect")  # with true depth apart, written 10 mm off
+    path = made.recording / "recording.json"
+    path.write_text(path.read_text().replace('"kinect"', '"none"'))
+    recording, robot = Recording(made.recording), RunFolder(made.run).robots["alpha"]
+    with open_rgbd(recording.log("alpha")) as log:
+        seen = list(rendering.scored_frames(log, [0, 1], recording, robot))
+    assert len(seen) == 2
+    pictured = _compared([view.frame for view in seen], recording, "alpha")
+    for view in (*seen, *pictured):
+        off_m = (view.exact_depth_m - view.frame.depth)[view.frame.depth > 0]
+        assert off_m == pytest.approx(0.010, abs=1e-4)
 
 
 def test_a_summary_counts_views_without_pose_apart():
