@@ -12,12 +12,15 @@ from duagc.converters.simulate.render import meshes, triangles
 from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
 from duagc.converters.simulate.scenes import textures as tex
 from duagc.converters.simulate.scenes.scene import Scene
-from duagc.converters.simulate.trajectories.walks import WalkableSpace, route
+from duagc.converters.simulate.trajectories.routes import ROUTE_STEP_M, length_of, route
+from duagc.converters.simulate.trajectories.walks import WalkableSpace
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 STEP_M = 0.025  # per frame
+START_M = 0.5  # of a route, before the first frame
 TALL_M, REACH_M = 1.75, 1.0  # a ball of that radius about its middle holds a figure
 APART_M = 1.2  # from every robot, if a walk allows it
 TRIES = 24
@@ -61,28 +64,44 @@ def walk(
         trajectories: of the robots, T_world_camera [frames, 4, 4].
         seed: of their paths and colors.
         cache: an existing folder, gets their triangles.
+
+    Raises:
+        DuagError: no walk is long enough for the frames.
     """
-    graph, frames = space.graph.tocsr(), len(trajectories[0])
-    cameras = np.stack(trajectories)
-    movers = []
+    cameras, movers = np.stack(trajectories), []
     for k in range(count):
+        floor = _walked(k, space, caster, cameras, seed=seed)
+        folder = cache / f"mover-{k}"
+        folder.mkdir()
+        triangles.write(_figure(k, seed), 0.006, folder)
+        movers.append(Mover(folder, _upright(floor, space.floor_m)))
+    return movers
+
+
+def _walked(k: int, space: WalkableSpace, caster: Caster, cameras: Array, *, seed: int) -> Array:
+    """Where figure k walks [frames, 2]; on longer routes if no route is long enough."""
+    graph, frames = space.graph.tocsr(), cameras.shape[1]
+    length_m, least_m = frames * STEP_M + 1.0, START_M + STEP_M * (frames - 1)
+    for asked_m in (0.0, least_m):
         best: tuple[float, Array] | None = None
         for attempt in range(TRIES):
             rng = random_streams.generator(seed, "simulate.mover", mover=k, attempt=attempt)
-            path = route(space, graph, frames * STEP_M + 1.0, rng)
-            spline = CubicSpline(0.025 * np.arange(len(path)), path)
-            floor = spline(0.5 + STEP_M * np.arange(frames))
+            path = route(space, graph, length_m, rng, least_m=asked_m)
+            if length_of(path) < least_m:
+                continue
+            spline = CubicSpline(ROUTE_STEP_M * np.arange(len(path)), path)
+            floor = spline(START_M + STEP_M * np.arange(frames))
             middle = np.column_stack([floor, np.full(frames, space.floor_m + 1.1)])
             gap = np.linalg.norm(cameras[:, :, :2, 3] - floor, axis=2).min()
             score = _seen(caster, cameras, middle) + min(0.0, gap - APART_M)
             if best is None or score > best[0]:
                 best = score, floor
-        assert best is not None
-        folder = cache / f"mover-{k}"
-        folder.mkdir()
-        triangles.write(_figure(k, seed), 0.006, folder)
-        movers.append(Mover(folder, _upright(best[1], space.floor_m)))
-    return movers
+        if best is not None:
+            return best[1]
+    raise DuagError(
+        f"simulate: found no walk of {least_m:.1f} m for a figure in {len(space.cells) * space.cell_m**2:.1f} m^2 of "
+        "free floor, expected one; give fewer frames"
+    )
 
 
 def _seen(caster: Caster, cameras: Array, middle: Array) -> float:

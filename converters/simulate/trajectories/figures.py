@@ -12,7 +12,8 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, look_at
-from duagc.converters.simulate.trajectories.walks import MAX_TURN_RAD, MIN_CLEARANCE_M, Terrain, route
+from duagc.converters.simulate.trajectories.routes import ROUTE_STEP_M, route
+from duagc.converters.simulate.trajectories.walks import MAX_TURN_RAD, MIN_CLEARANCE_M, Terrain
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
@@ -167,7 +168,7 @@ class Ground:
         curve = None
         if paradigm == "leader-follower":
             whole = length + (robots - 1) * longest_lag(length, robots) + 2 * RESERVE_M
-            curve = route(space, self._graph, whole, rng)[:: round(POINT_M / 0.025)]
+            curve = route(space, self._graph, whole, rng)[:: round(POINT_M / ROUTE_STEP_M)]
         extent = float(np.ptp(space.cells, axis=0).max())
         middle = space.cells[rng.choice(len(space.cells), p=space.clearance / space.clearance.sum())]
         if paradigm == "concentric":

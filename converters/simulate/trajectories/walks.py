@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, label
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from duagc.converters.simulate.render.raycast import Caster
 from duagc.converters.simulate.render.renderer import CameraRenderer
 from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, OVERLAP_IMAGE, look, look_at, shared
+from duagc.converters.simulate.trajectories.routes import ROUTE_STEP_M, length_of, route
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
@@ -42,8 +42,6 @@ FLOOR_SHARE = 0.25  # of the largest level; the lowest of the levels so large is
 CLOSED_SHARE = 0.85  # of the directions around a place inside the scene meet a surface
 DIRECTIONS = 48
 LEAST_FREE_M2 = 1.0
-HOP_M = 2.0  # least distance between places that a walk visits
-SMOOTH_M = 0.35
 AHEAD_M = 1.3
 GAZE_SMOOTH_FRAMES = (14, 22, 32, 45, 60)
 TRIES, ENOUGH = 400, 16
@@ -53,6 +51,8 @@ NEAR_M, MAX_NEAR_SHARE = 0.6, 0.25
 MAX_HOLE_SHARE, MAX_SKY_SHARE = 0.05, 0.5
 LEAST_MEDIAN_M = 1.0
 EDGE_GRAY = 6.0  # of 255, between neighboring pixels of VIEW_IMAGE
+NEAREST_M = MIN_CLEARANCE_M - 0.05  # of a smoothed walk
+TOO_SHORT, HOLES = "too short", "sees holes or a near wall"
 
 
 @dataclass(frozen=True)
@@ -241,75 +241,52 @@ def _graph(inside: NDArray[np.bool_], clearance: Array, cell_m: float) -> coo_ar
 def _candidates(
     terrain: Terrain, space: WalkableSpace, robot: int, frames: int, *, camera: PinholeCamera, seed: int
 ) -> list[Array]:
-    """Walks of a robot that keep clear and see something."""
+    """Walks of a robot that keep clear and see something; those of longer routes if no route is long enough."""
     graph = space.graph.tocsr()
     renderer = terrain.renderer(camera.scaled(*VIEW_IMAGE))
+    length_m = frames * terrain.step_m + 2 * AHEAD_M + 1.0
     found: list[Array] = []
-    reasons = {"too near to something": 0, "turns too fast": 0, "sees holes or a near wall": 0}
-    for attempt in range(TRIES):
-        rng = random_streams.generator(seed, "simulate.walk", robot=robot, attempt=attempt)
-        floor_way = route(space, graph, frames * terrain.step_m + 2 * AHEAD_M + 1.0, rng)
-        poses = _look_ahead(floor_way, space.floor_m, robot, frames, step_m=terrain.step_m, rng=rng)
-        if poses is None:
-            reasons["turns too fast"] += 1
-        elif (
-            _body_clearance(terrain.clearance, poses[:, :2, 3], space.floor_m).min() < MIN_CLEARANCE_M - 0.05
-        ):
-            reasons["too near to something"] += 1
-        elif not sees_enough(renderer, poses, terrain.sky):
-            reasons["sees holes or a near wall"] += 1
-        else:
-            found.append(poses)
-        if len(found) == ENOUGH:
+    for least_m in (0.0, length_m):
+        reasons = dict.fromkeys((TOO_SHORT, "turns too fast", "too near to something", HOLES), 0)
+        for attempt in range(TRIES):
+            rng = random_streams.generator(seed, "simulate.walk", robot=robot, attempt=attempt)
+            way = route(space, graph, length_m, rng, least_m=least_m)
+            if length_of(way) < 2 * AHEAD_M + (frames - 1) * terrain.step_m:
+                reasons[TOO_SHORT] += 1
+                continue
+            poses = _look_ahead(way, space.floor_m, robot, frames, step_m=terrain.step_m, rng=rng)
+            if poses is None:
+                reasons["turns too fast"] += 1
+            elif _body_clearance(terrain.clearance, poses[:, :2, 3], space.floor_m).min() < NEAREST_M:
+                reasons["too near to something"] += 1
+            elif not sees_enough(renderer, poses, terrain.sky):
+                reasons[HOLES] += 1
+            else:
+                found.append(poses)
+            if len(found) == ENOUGH:
+                break
+        if found or not reasons[TOO_SHORT]:
             break
     if not found:
         why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
         area = len(space.cells) * space.cell_m**2
         raise DuagError(
             f"no walk for robot {robot} in {TRIES} tries ({why}) in {area:.1f} m^2 of free floor, "
-            " expected one; give another --seed, or fewer frames"
+            "expected one; give another --seed, or fewer frames"
         )
     return found
-
-
-def route(space: WalkableSpace, graph: coo_array, length_m: float, rng: np.random.Generator) -> Array:
-    """A path over the floor [n, 2] of at least a length, through places drawn at random, smoothed, 25 mm apart."""
-    here = int(rng.integers(len(space.cells)))
-    cells, total = [here], 0.0
-    while total < length_m:
-        _, before = dijkstra(graph, directed=False, indices=here, return_predecessors=True)
-        far = np.linalg.norm(space.cells - space.cells[here], axis=1) >= HOP_M
-        choice = np.flatnonzero(far) if far.any() else np.setdiff1d(np.arange(len(space.cells)), [here])
-        leg = [int(rng.choice(choice))]
-        while leg[-1] != here:
-            leg.append(int(before[leg[-1]]))
-        cells += leg[-2::-1]
-        here = cells[-1]
-        total = float(np.linalg.norm(np.diff(space.cells[cells], axis=0), axis=1).sum())
-    path = _resampled(space.cells[cells], 0.025)
-    return _resampled(gaussian_filter1d(path, SMOOTH_M / 0.025, axis=0, mode="nearest"), 0.025)
-
-
-def _resampled(path: Array, step_m: float) -> Array:
-    """Points of a polyline [n, 2] at equal distances along it."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    keep = np.concatenate([[True], np.diff(along) > 1e-9])
-    wanted = np.arange(0.0, along[-1], step_m)
-    return np.stack([np.interp(wanted, along[keep], path[keep, k]) for k in range(2)], axis=1)
 
 
 def _look_ahead(
     path: Array, floor: float, robot: int, frames: int, *, step_m: float, rng: np.random.Generator
 ) -> Array | None:
-    """Poses [frames, 4, 4] along a path, step_m apart, or None if they turn too fast or the path is too short."""
-    along = 0.025 * np.arange(len(path))
+    """Poses [frames, 4, 4] along a path that is long enough, step_m apart, or None if they turn too fast."""
+    along = ROUTE_STEP_M * np.arange(len(path))
     spline = CubicSpline(along, path)
     start = AHEAD_M
     margin = max(GAZE_SMOOTH_FRAMES)
     index = np.arange(-margin, frames + margin)
     s = np.clip(start + index * step_m, 0.0, along[-1] - AHEAD_M)
-    if along[-1] - AHEAD_M < start + (frames - 1) * step_m:
-        return None
     waver = rng.uniform((0.02, 0.15, 0.02), (0.05, 0.4, 0.1))  # height m, yaw rad, pitch rad
     periods = rng.uniform((2.0, 3.0, 2.5), (3.5, 6.0, 5.0))
     phases = rng.uniform(0, 2 * np.pi, 3)
