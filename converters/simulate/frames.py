@@ -27,7 +27,6 @@ from duagc.converters.simulate.settings import Cover, SimulationSettings
 from duagc.converters.simulate.simulated_scenes import SceneOnDisk, SimulatedScene
 from duagc.pipeline.base import determinism, random_streams
 from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 PNG_LEVEL = 1
@@ -43,6 +42,7 @@ class FrameJob:
         T_world_camera: [4, 4].
         twist: [6], its motion per second, a right tangent (m, rad).
         gains: of red, green and blue, factors of the light.
+        T_world_depth: [4, 4], where the camera was when a late depth image was taken; None: it is not late.
     """
 
     robot: str
@@ -50,6 +50,7 @@ class FrameJob:
     T_world_camera: NDArray[np.float64]
     twist: NDArray[np.float64]
     gains: tuple[float, ...] = (1.0, 1.0, 1.0)
+    T_world_depth: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,10 @@ class FrameRenderer:
             return self._covered()
         view, mask = self._view(job, job.T_world_camera)
         color, exact_m = self._lit(view.color, job), view.depth
-        depth_m = self._depth_before(job) if settings.degradations.depth_delay_s > 0 else exact_m
+        depth_m = exact_m
+        if job.T_world_depth is not None:
+            depth_m, still_before = self._depth_before(job, job.T_world_depth)
+            mask = mask if still_before is None or mask is None else mask & still_before
         sigma_m, points = None, None
         if settings.noise == "kinect":
             rng = random_streams.generator(settings.seed, "simulate.noise", robot=job.robot, frame=job.index)
@@ -187,12 +191,15 @@ class FrameRenderer:
             return color
         return with_light(color, np.array(job.gains), self.vignette)
 
-    def _depth_before(self, job: FrameJob) -> NDArray[np.float64]:
-        """Exact depth as it was a delay before the frame."""
-        T = job.T_world_camera @ se3.exp(-self.settings.degradations.depth_delay_s * job.twist)
+    def _depth_before(
+        self, job: FrameJob, T_world_depth: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
+        """Exact depth as it was a delay before the frame, and where nothing moved in it, if anything can."""
         if self.moving is None:
-            return self.renderer.depth(T)[0]
-        return self.moving.depth(T, job.index)[0]
+            return self.renderer.depth(T_world_depth)[0], None
+        before = job.index - self.settings.degradations.depth_delay_s * FRAME_RATE_HZ
+        depth_m, moved = self.moving.depth(T_world_depth, before)
+        return depth_m, ~moved
 
     def _covered(self) -> FrameImages:
         """What a covered camera sees: nothing; the mask, where there are any, is that of the lens."""

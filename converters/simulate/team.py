@@ -18,12 +18,12 @@ from duagc.converters.simulate.sensors.rig import RANGE_SIGMA_M, T_CAMERA_LIDAR,
 from duagc.converters.simulate.settings import Cover, SimulationSettings, camera_of, scene_of
 from duagc.converters.simulate.simulated_scenes import SimulatedMeshes, SimulatedScene, set_up
 from duagc.converters.simulate.trajectories import loops, paradigms
+from duagc.converters.simulate.trajectories.moments import pose_at, twists_of
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
-from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 START_NS = 1_000_000_000
@@ -279,8 +279,16 @@ class _Team:
         robots = zip(
             self.names, self.trajectories, self._twists, self._exposures, self._balances, strict=True
         )
+        delay = self.settings.degradations.depth_delay_s * FRAME_RATE_HZ
         return [
-            FrameJob(name, i, path[i], twists[i], tuple((exposures[i] * balances[i]).tolist()))
+            FrameJob(
+                name,
+                i,
+                path[i],
+                twists[i],
+                tuple((exposures[i] * balances[i]).tolist()),
+                T_world_depth=pose_at(path, i - delay) if delay > 0 else None,
+            )
             for name, path, twists, exposures, balances in robots
             for i in self._kept[name]
         ]
@@ -351,16 +359,6 @@ def _check_output(workers: int, preview: Path | None) -> None:
         raise DuagError(
             f"{preview}: found no such place for a picture, expected NAME.png in a folder that exists"
         )
-
-
-def twists_of(T_world_camera: Array) -> Array:
-    """Motion per second along a path, right tangents [frames, 6]; the last frame moves on as the one before.
-
-    Args:
-        T_world_camera: [frames, 4, 4].
-    """
-    twist = FRAME_RATE_HZ * se3.log(se3.inverse(T_world_camera[:-1]) @ T_world_camera[1:])
-    return np.concatenate([twist, twist[-1:]])
 
 
 def _log_metadata(rig: Rig, settings: SimulationSettings) -> dict[str, str]:

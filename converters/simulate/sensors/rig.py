@@ -15,6 +15,7 @@ from duagc.converters.simulate.movers import Mover
 from duagc.converters.simulate.render.raycast import OFFSETS, MeshRenderer
 from duagc.converters.simulate.render.renderer import RenderedView
 from duagc.converters.simulate.sensors.lens import Lens
+from duagc.converters.simulate.trajectories.moments import pose_at
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
@@ -149,12 +150,12 @@ class MovingCamera:
         color = np.clip(np.rint(_value(mean) if blurs else mean), 0, 255).astype(np.uint8)
         return RenderedView(color, depth, np.zeros(shape, dtype=np.int64)), ~(moving | moved)
 
-    def depth(self, T_world_camera: Array, frame: int) -> tuple[Array, NDArray[np.bool_]]:
+    def depth(self, T_world_camera: Array, frame: float) -> tuple[Array, NDArray[np.bool_]]:
         """Depth (z, m, 0 = nothing) at one moment, and where something moves, [h, w].
 
         Args:
             T_world_camera: [4, 4].
-            frame: index, for the movers.
+            frame: index, for the movers; may be between two frames.
         """
         shape = (self.camera.height, self.camera.width)
         still = np.broadcast_to(T_world_camera, (shape[0], 4, 4))
@@ -163,13 +164,13 @@ class MovingCamera:
         return depth, moved.reshape(shape)
 
     def _trace(
-        self, origins: Array, directions: NDArray[np.float32], frame: int
+        self, origins: Array, directions: NDArray[np.float32], frame: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """z, color and whether it moves, of what rays meet first."""
         t, colors = self.renderer.shade(origins, directions)
         moving = np.zeros(len(t), dtype=np.bool_)
         for mover, renderer in self.movers:
-            T = mover.poses[frame]
+            T = pose_at(mover.poses, frame)
             near = np.flatnonzero(mover.near(T, origins, directions))
             if near.size:
                 start, direction = (

@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from duagc.converters.simulate.frames import FrameJob, FrameRenderer, FrameSettings
+from duagc.converters.simulate.movers import Mover, _figure
+from duagc.converters.simulate.render import triangles
 from duagc.converters.simulate.render.raycast import MeshRenderer
 from duagc.converters.simulate.sensors import light, noise, shutter
 from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
@@ -15,7 +18,9 @@ from duagc.converters.simulate.sensors.lens import Lens
 from duagc.converters.simulate.sensors.rig import GAMMA, MovingCamera, Rig
 from duagc.converters.simulate.settings import camera_of
 from duagc.converters.simulate.simulated_scenes import SimulatedMeshes
-from duagc.converters.simulate.team import simulate, twists_of
+from duagc.converters.simulate.team import simulate
+from duagc.converters.simulate.trajectories.loops import look_at
+from duagc.converters.simulate.trajectories.moments import pose_at, twists_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd
@@ -257,20 +262,51 @@ def test_depth_comes_in_steps_that_grow_with_its_square() -> None:
     assert noise.quantized(depth, 0.0) is depth
 
 
-def test_delayed_depth_is_that_of_the_pose_before(
+def test_delayed_depth_is_that_of_the_path_before(
     folder: Path, stage: SimulatedMeshes, tmp_path: Path
 ) -> None:
-    delay_s = 0.03
-    recording = Recording(simulated(folder, tmp_path / "late", robots=1, depth_delay_s=delay_s))
-    path = true_poses(recording, "alpha")
+    recording = Recording(simulated(folder, tmp_path / "late", robots=1, depth_delay_s=2 / FRAME_RATE_HZ))
+    path, frames = true_poses(recording, "alpha"), frames_of(recording.path)
     eye = stage.renderer(camera_of((64, 48)))
-    late, in_time = [], []
-    for frame, T, twist in zip(frames_of(recording.path), path, twists_of(path), strict=True):
-        then = eye.depth(T @ se3.exp(-delay_s * twist))[0]
-        late.append(np.abs(frame.depth - then).max())
-        in_time.append(np.abs(frame.depth - eye.depth(T)[0]).max())
-    assert max(late) < 2e-4  # the unit of its images
-    assert min(in_time) > 1e-3
+    for before, frame in zip(path, frames[2:], strict=False):
+        assert np.abs(frame.depth - eye.depth(before)[0]).max() < 2e-4  # the unit of its images
+        assert np.abs(frame.depth - eye.depth(path[frame.index])[0]).max() > 1e-3
+    # before the path began, the camera moved as it does between the first two frames
+    back = path[0] @ se3.inverse(path[1]) @ path[0]
+    assert np.abs(frames[1].depth - eye.depth(back)[0]).max() < 2e-4
+
+
+def test_a_pose_between_two_frames_moves_evenly() -> None:
+    step = np.array([0.1, -0.02, 0.05, 0.2, 0.1, -0.3])
+    path = np.stack([se3.exp(k * step) for k in range(3)] + [se3.exp(2 * step) @ se3.exp(-step)])
+    for moment, T in ((1.25, se3.exp(1.25 * step)), (-0.5, se3.exp(-0.5 * step)), (2.5, se3.exp(1.5 * step))):
+        assert pose_at(path, moment) == pytest.approx(T, abs=1e-12)
+    assert np.array_equal(pose_at(path, 2.0), path[2])
+    assert np.array_equal(pose_at(path, 3), path[3])
+
+
+def test_delayed_depth_shows_a_figure_where_it_was_and_both_places_are_masked(
+    stage: SimulatedMeshes, tmp_path: Path
+) -> None:
+    triangles.write(_figure(0, 0), 0.02, tmp_path)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :2, 3] = np.array([1.6, 2.0]) + np.arange(4)[:, None] * np.array([0.2, 0.0])
+    T = look_at(np.array([[2.0, 0.5, 1.2]]), np.array([[2.0, 2.0, 1.0]]))[0]
+    dials = Degradations(depth_delay_s=1.5 / FRAME_RATE_HZ)
+    settings = FrameSettings(CAMERA, "none", 0, Rig(), [Mover(tmp_path, poses)], (), dials)
+    renderer = FrameRenderer(stage, settings)
+    assert renderer.moving is not None
+    image = renderer.render(FrameJob("alpha", 3, T, np.zeros(6), T_world_depth=T))
+    alone = poses.copy()
+    alone[:, 0, 3] -= 0.3  # of 1.5 frames
+    earlier = MovingCamera(renderer.renderer, Rig(), [Mover(tmp_path, alone)])
+    then_m, then = earlier.depth(T, 3)
+    _, now = renderer.moving.depth(T, 3)
+    assert image.depth is not None
+    assert image.mask is not None
+    assert np.abs(image.depth * stage.depth_scale_m - then_m).max() < 2e-4
+    assert min((then & ~now).sum(), (now & ~then).sum()) > 100
+    assert not (image.mask & (then | now)).any()
 
 
 # --- which frames there are

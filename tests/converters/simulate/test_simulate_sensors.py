@@ -16,7 +16,8 @@ from duagc.converters.simulate.sensors.rig import (
 )
 from duagc.converters.simulate.settings import camera_of
 from duagc.converters.simulate.simulated_scenes import SimulatedMeshes
-from duagc.converters.simulate.team import simulate, twists_of
+from duagc.converters.simulate.team import simulate
+from duagc.converters.simulate.trajectories.moments import twists_of
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import groundtruth
