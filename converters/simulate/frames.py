@@ -150,7 +150,7 @@ class FrameRenderer:
         settings, rig = self.settings, self.settings.rig
         if any(cover.hides(job.robot, job.index) for cover in settings.covers):
             return self._covered()
-        view, mask = self._view(job, job.T_world_camera)
+        view, mask = self._view(job, job.T_world_camera, job.twist)
         color, exact_m = self._lit(view.color, job), view.depth
         depth_m = exact_m
         if job.T_world_depth is not None:
@@ -217,11 +217,11 @@ class FrameRenderer:
         )
 
     def _view(
-        self, job: FrameJob, T_world_camera: NDArray[np.float64]
+        self, job: FrameJob, T_world_camera: NDArray[np.float64], twist: NDArray[np.float64]
     ) -> tuple[RenderedView, NDArray[np.bool_] | None]:
         if self.moving is None:
             return self.renderer.render(T_world_camera), None
-        return self.moving.render(T_world_camera, job.twist, job.index)
+        return self.moving.render(T_world_camera, twist, job.index)
 
     def _stereo_depth(
         self, job: FrameJob, left: NDArray[np.uint8]
@@ -229,7 +229,9 @@ class FrameRenderer:
         """Depth and its standard deviation (m) by matching with a second camera to the right."""
         T_world_right = job.T_world_camera.copy()
         T_world_right[:3, 3] += BASELINE_M * job.T_world_camera[:3, 0]
-        right, _ = self._view(job, T_world_right)
+        twist_right = job.twist.copy()
+        twist_right[:3] += np.cross(job.twist[3:], [BASELINE_M, 0.0, 0.0])
+        right, _ = self._view(job, T_world_right, twist_right)
         gray = [np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), np.uint8) for each in (left, right.color)]
         depth_m, sigma_m = self.stereo.depth(gray[0], gray[1])
         return _units(depth_m.astype(np.float64), self.depth_scale_m), sigma_m

@@ -302,9 +302,10 @@ class _Team:
             sheet: gets the frames that it shows.
         """
         rig = self.rig
-        sensors = _log_metadata(rig, self.settings)
         k1 = self.settings.degradations.lens_k1
-        camera = Lens(self.camera, k1).pinhole if k1 != 0 else self.camera
+        lens = Lens(self.camera, k1) if k1 != 0 else None
+        sensors = _log_metadata(rig, self.settings, lens)
+        camera = self.camera if lens is None else lens.pinhole
         for name, path in zip(self.names, self.trajectories, strict=True):
             scale_m = self.scene.depth_scale_m
             # black that was rendered is part of the scene
@@ -361,13 +362,13 @@ def _check_output(workers: int, preview: Path | None) -> None:
         )
 
 
-def _log_metadata(rig: Rig, settings: SimulationSettings) -> dict[str, str]:
-    """What a log says about its sensors, as far as a camera's maker states it."""
+def _log_metadata(rig: Rig, settings: SimulationSettings, lens: Lens | None) -> dict[str, str]:
+    """What a log says about its sensors, as far as a camera's maker states it; the readout is of undistorted images."""
     metadata = {"depth_noise": settings.noise} if rig.sensor == "rgbd" else {"depth": rig.sensor}
     if rig.readout_s > 0:
-        metadata["rolling_shutter_s"] = repr(rig.readout_s)
+        metadata["rolling_shutter_s"] = repr(rig.readout_s * (1.0 if lens is None else lens.rows_per_row))
     if rig.exposure_s > 0:
         metadata["exposure_s"] = repr(rig.exposure_s)
-    if settings.degradations.lens_k1 != 0:
-        metadata["lens_k1"] = repr(settings.degradations.lens_k1)
+    if lens is not None:
+        metadata["lens_k1"] = repr(lens.k1)
     return metadata

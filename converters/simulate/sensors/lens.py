@@ -89,3 +89,12 @@ class Lens:
         u, v = c.fx * x + c.cx, c.fy * y + c.cy
         inside = (u >= 0) & (u <= c.width - 1) & (v >= 0) & (v <= c.height - 1)
         return u.astype(np.float32), v.astype(np.float32), inside
+
+    @property
+    def rows_per_row(self) -> float:
+        """How many rows of the distorted image a row of `pinhole` is, along the middle column, by least squares."""
+        _, v, inside = self.maps()
+        column = self.camera.width // 2
+        rows = np.flatnonzero(inside[:, column])
+        seen, middle = v[rows, column].astype(np.float64), rows - rows.mean()
+        return float((middle * seen).sum() / (middle**2).sum())

@@ -9,6 +9,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.shutter import LONGEST_S
 
 MOMENT_S = 0.005  # over which the speed of a pixel is measured
 FRAMES = 40  # of a path
@@ -55,7 +56,7 @@ def exposure_for(
         camera: whose pixels are meant.
 
     Raises:
-        DuagError: the robots do not move.
+        DuagError: the robots do not move, or so slowly that no log may state the exposure.
     """
     speeds = []
     for path, twist in zip(paths, twists, strict=True):
@@ -66,4 +67,10 @@ def exposure_for(
         raise DuagError(
             f"simulate: motion blur is {blur_px:g} px where nothing moves, expected robots that move"
         )
-    return blur_px / speed
+    exposure_s = blur_px / speed
+    if exposure_s > LONGEST_S:
+        raise DuagError(
+            f"simulate: motion blur of {blur_px:g} px takes an exposure of {exposure_s:.2f} s at the robots' speed, "
+            f"expected at most {LONGEST_S:g} s"
+        )
+    return exposure_s

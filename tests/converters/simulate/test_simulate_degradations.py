@@ -354,7 +354,8 @@ def test_all_together_are_in_the_description(all_degradations: Path) -> None:
     description = json.loads((all_degradations / "recording.json").read_text())
     assert description["parameters"]["degradations"]["lens_k1"] == -0.3
     sensors = description["robots"]["alpha"]["sensors"]
-    assert float(sensors["rolling_shutter_s"]) == 0.03
+    lens = Lens(camera_of((64, 48)), -0.3)
+    assert float(sensors["rolling_shutter_s"]) == 0.03 * lens.rows_per_row
     assert float(sensors["exposure_s"]) > 0
 
 
