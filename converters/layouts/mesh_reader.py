@@ -35,6 +35,7 @@ WHITE = 255
 MAX_VERTICES = 2**31 - 1
 LINUX = sys.platform == "linux"  # elsewhere, address space is not limited
 MAX_PIXELS = 1 << 26  # of a texture, as of any image here
+MAX_SIDE = 32766  # pixels of a texture: OpenCV looks nothing up in larger ones
 MAX_EXTENT_M = 400.0  # in each direction; robots walk on a grid of 0.2 m
 
 NOT_READ = ("failed for file", "Unsupported", "undecodable", "I/O error", "unknown file signature")
@@ -230,6 +231,10 @@ def _texture(path: Path, materials: Any, index: int) -> NDArray[np.uint8] | None
     height, width = image.shape[:2]
     if height * width > MAX_PIXELS:
         raise DuagError(f"{path}: has a texture of {width} x {height} pixels, expected at most {MAX_PIXELS}")
+    if max(height, width) > MAX_SIDE:
+        raise DuagError(
+            f"{path}: has a texture of {width} x {height} pixels, expected sides of at most {MAX_SIDE}"
+        )
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
     if image.ndim == 2:

@@ -75,7 +75,8 @@ class MeshScene:
         if plain.size == len(triangle):
             return colors
         whole = np.minimum(level, LEVELS - 1.001).astype(np.int32)
-        place = np.where(of == NO_TEXTURE, -1, of * LEVELS + whole).astype(np.int16)
+        few = len(self.textures) * LEVELS <= np.iinfo(np.int16).max  # 16 bits are sorted faster
+        place = np.where(of == NO_TEXTURE, -1, of * LEVELS + whole).astype(np.int16 if few else np.int32)
         order = np.argsort(place, kind="stable")
         values, first = np.unique(place[order], return_index=True)
         for value, some in zip(values.tolist(), np.split(order, first[1:]), strict=True):
@@ -155,14 +156,26 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def check_up(up: str) -> None:
+    """Refuse an axis that cannot be up.
+
+    Args:
+        up: as it was asked for.
+
+    Raises:
+        DuagError: it is none of UPS.
+    """
+    if up not in UPS:
+        raise DuagError(f"simulate: up is {up!r}, expected one of {', '.join(UPS)}")
+
+
 def up_axis(files: list[Path], up: str) -> str:
     """ "y" or "z": what was asked for, or the custom of the format.
 
     Raises:
         DuagError: the files are of formats with different customs.
     """
-    if up not in UPS:
-        raise DuagError(f"simulate: up is {up!r}, expected one of {', '.join(UPS)}")
+    check_up(up)
     if up != "auto":
         return up
     customs = {UP_OF_SUFFIX[path.suffix.lower()]: path.name for path in files}

@@ -41,6 +41,11 @@ def large(folder: Path) -> None:
     (folder / "table1.png").write_bytes(png_bomb(20_000, 4_000, 8, 2))
 
 
+def wide(folder: Path) -> None:
+    folder_of(folder, "obj")
+    (folder / "table1.png").write_bytes(png_bomb(33_000, 8, 8, 2))
+
+
 def pipe(folder: Path) -> None:
     folder_of(folder, "obj")
     (folder / "table1.png").unlink()
@@ -91,6 +96,7 @@ def read(folder: Path, cache: Path) -> meshes.MeshScene:
         (torn, "table.obj: its reader says 'Read Error'"),
         (bomb, "table.obj: takes more than .* MB of memory|table.obj: .*20000 x 20000 pixels"),
         (large, "table.obj: has a texture of 20000 x 4000 pixels, expected at most"),
+        (wide, "table.obj: has a texture of 33000 x 8 pixels, expected sides of at most 32766"),
         (pipe, "table.obj: waits for something that does not come"),
         (named_in_latin, "table.obj: its reader finds a name that is no UTF-8"),
         (mesh_pipe, "room.ply: is no regular file"),

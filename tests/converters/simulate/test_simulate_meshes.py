@@ -309,3 +309,14 @@ def test_a_chunk_of_a_real_scan(tmp_path):
     view = MeshRenderer(caster, camera_of((160, 120))).render(T)
     assert np.mean(view.depth > 0) > 0.95
     assert view.color[view.depth > 0].std() > 20
+
+
+def test_a_scene_of_many_textures_has_the_colors_of_each() -> None:
+    count = 5600
+    textures = [[np.full((2, 2, 3), 1 + k % 250, np.uint8)] for k in range(count)]
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    each, three = np.arange(count, dtype=np.int32), np.arange(3, dtype=np.int32)
+    texels, white = np.zeros((count, 3, 2), np.float32), np.zeros((3, 3), np.uint8)
+    scene = meshes.MeshScene(corners, np.tile(three, (count, 1)), texels, each, white, textures)
+    seen = scene.sample(each, np.full((count, 2), 0.3, np.float32), np.zeros(count, np.float32))
+    assert np.array_equal(seen, np.repeat(1.0 + each[:, None] % 250, 3, axis=1))
