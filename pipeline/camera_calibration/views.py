@@ -256,7 +256,11 @@ def normals_at(
 
 
 def _velocities(tracked: Tracked, chosen: NDArray[np.int64]) -> Array:
-    before, after = np.maximum(chosen - 1, 0), np.minimum(chosen + 1, len(tracked.ok) - 1)
+    """Motion [n, 6] between the frames before and after each; held-out ones are stepped over."""
+    taking_part = np.flatnonzero(~tracked.held_out)
+    place = np.searchsorted(taking_part, chosen)
+    before = taking_part[np.maximum(place - 1, 0)]
+    after = taking_part[np.minimum(place + 1, len(taking_part) - 1)]
     T = tracked.T_map_camera
     seconds = 1e-9 * (tracked.stamps_ns[after] - tracked.stamps_ns[before])
     motion = se3.log(se3.inverse(T[before]) @ T[after]) / np.maximum(seconds, 1e-3)[:, None]

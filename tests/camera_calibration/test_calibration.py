@@ -32,6 +32,7 @@ from duagc.pipeline.camera_calibration.views import (
     Tracked,
     Views,
     _landmarks,
+    _velocities,
     load_views,
     track_log,
 )
@@ -250,6 +251,16 @@ def test_held_out_frames_take_no_part(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.undo()
     held_out = track_log(tracked.path, "alpha", FrontendConfig()).held_out
     np.testing.assert_array_equal(held_out, tracked.held_out)
+
+
+def test_poses_of_held_out_frames_move_no_view() -> None:
+    held_out = np.array([is_held_out(k) for k in range(20)])
+    T = np.tile(np.eye(4), (20, 1, 1))
+    T[:, 0, 3] = 0.03 * np.arange(20)
+    T[held_out, 1, 3] = 0.5
+    tracked = Tracked(Path(), "alpha", T, np.ones(20, bool), held_out, 100_000_000 * np.arange(20))
+    velocity = _velocities(tracked, np.flatnonzero(~held_out))
+    assert velocity == pytest.approx(np.tile([0.3, 0, 0, 0, 0, 0], (18, 1)), abs=1e-9)
 
 
 def test_a_wall_without_texture_is_refused(tmp_path: Path) -> None:
