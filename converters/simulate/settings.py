@@ -210,10 +210,11 @@ def scene_of(scene: str, up: str) -> tuple[dict[str, Any], dict[str, Any]]:
         scene: one of `SCENES`, or a folder of textured meshes.
         up: as in `SimulationSettings`.
     """
-    if scene in SCENES:
-        return {"kind": "simulation"}, {"scene": scene}
     from duagc.converters.simulate.render import meshes
 
+    meshes.check_up(up)
+    if scene in SCENES:
+        return {"kind": "simulation"}, {"scene": scene}
     folder = Path(scene).resolve()
     files = meshes.mesh_files(folder)
     source = {"kind": "simulation", "scene": folder.name, "files_sha256": meshes.digests(files)}

@@ -104,7 +104,7 @@ def simulate(
         triangles=triangles,
     )
     settings.check()
-    _check_output(workers, preview)
+    _check_output(out, workers, preview)
     _check_paths(settings, paths)
     determinism.configure_determinism()
     determinism.configure_opencv()
@@ -253,7 +253,7 @@ class _Team:
             recording.checks["clock_offset_ns"] = self._clocks_ns
         if rig.gain_stops > 0:
             recording.checks["exposure_gain"] = {
-                name: [rig.gain(seed, name, i / FRAME_RATE_HZ) for i in range(self.settings.frames)]
+                name: [rig.gain(seed, name, i / FRAME_RATE_HZ) for i in self._kept[name]]
                 for name in self.names
             }
         if rig.camera_stops > 0:
@@ -350,10 +350,12 @@ def _check_paths(settings: SimulationSettings, paths: Sequence[Array] | None) ->
         raise DuagError(f"simulate: paths are of shapes {found}, expected {expected}")
 
 
-def _check_output(workers: int, preview: Path | None) -> None:
+def _check_output(out: Path, workers: int, preview: Path | None) -> None:
     """Refuse a number of workers or a picture that cannot be."""
     if not 1 <= workers <= MAX_WORKERS:
         raise DuagError(f"simulate: workers is {workers}, expected 1 to {MAX_WORKERS}")
+    if preview is not None and Path(out).resolve() in preview.resolve().parents:
+        raise DuagError(f"{preview}: is inside the recording that is replaced, expected a picture elsewhere")
     if preview is not None and preview.exists():
         raise DuagError(f"{preview}: exists already, expected the name of a new picture")
     if preview is not None and (preview.suffix != ".png" or not preview.absolute().parent.is_dir()):

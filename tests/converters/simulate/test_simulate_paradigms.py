@@ -209,12 +209,25 @@ def test_depth_in_a_real_scan_is_that_of_the_recorded_pose(tmp_path, paradigm):
 
 
 @pytest.mark.parametrize(
-    "bad", [{"paradigm": "spiral"}, {"preview": Path("nowhere/sheet.png")}, {"preview": Path("a.jpg")}]
+    "bad",
+    [
+        {"paradigm": "spiral"},
+        {"preview": Path("nowhere/sheet.png")},
+        {"preview": Path("a.jpg")},
+        {"up": "x"},
+    ],
 )
 def test_arguments_out_of_range_are_refused(tmp_path, bad):
     with pytest.raises(DuagError, match="expected"):
         simulate(tmp_path / "rec", **bad)
     assert not (tmp_path / "rec").exists()
+
+
+def test_a_picture_inside_the_recording_that_is_replaced_is_refused(folder, tmp_path):
+    kind = {"scene": str(folder), "robots": 1, "frames": 2, "size": (32, 32), "workers": 1}
+    simulate(tmp_path / "rec", **kind)
+    with pytest.raises(DuagError, match=r"p\.png: is inside the recording that is replaced, expected"):
+        simulate(tmp_path / "rec", force=True, preview=tmp_path / "rec" / "p.png", **kind)
 
 
 def test_where_a_figure_fits_nowhere_is_said(room, monkeypatch):

@@ -1,6 +1,8 @@
-"""Rolling shutters and exposures together with a lens, with a second camera, and at the speed of the robots."""
+"""Rolling shutters, exposures and gains together with a lens, with a second camera, and at the speed of the robots."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,3 +76,17 @@ def test_blur_that_takes_too_long_an_exposure_is_refused(folder: Path, tmp_path:
             degradations=Degradations(blur_px=60.0),
         )
     assert not out.exists()
+
+
+def test_a_recording_states_one_gain_for_each_of_its_frames(folder: Path, tmp_path: Path) -> None:
+    of_all: dict[str, Any] = {"scene": str(folder), "robots": 1, "frames": 10, "size": (32, 32), "workers": 1}
+    rig = Rig(gain_stops=1.0)
+    whole, few = tmp_path / "whole", tmp_path / "few"
+    simulate(whole, rig=rig, **of_all)
+    simulate(few, rig=rig, degradations=Degradations(missing=0.4), **of_all)
+    (gains, _), (some, kept) = (
+        (checks["exposure_gain"]["alpha"], checks.get("frames_of_path", {}).get("alpha"))
+        for checks in (json.loads((out / "recording.json").read_text())["checks"] for out in (whole, few))
+    )
+    assert len(kept) == 6
+    assert some == [gains[k] for k in kept]
