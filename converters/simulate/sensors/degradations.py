@@ -1,7 +1,8 @@
 """Degradations of a color and depth camera that a recording can be simulated with, each with a dial of its own.
 
 At zero a dial changes nothing, and it changes nothing but what it names: the scene, the paths, the noise of a frame and
-what the other dials draw stay the same. Rolling shutter has its dial in `Rig`, as it had before.
+what the other dials draw stay the same. In the room alone, dials that need triangles have paths of their own. Rolling
+shutter has its dial in `Rig`, as it had before.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,8 @@ class Degradations:
     """What makes a camera worse than an ideal one.
 
     Attributes:
-        auto_exposure: largest change of the gain by automatic exposure, a share: 0.3 is 1/1.3 to 1.3 of the light.
+        auto_exposure: largest change of the gain by automatic exposure if it had no lag, a share: 0.3 is 1/1.3 to
+            1.3 of the light.
         exposure_lag_s: time constant of the automatic exposure.
         white_balance: largest drift of red, and the other way of blue, against green, a share of the light.
         vignette: share of the light that the corners lose.
