@@ -20,13 +20,15 @@ _TIMES = {
     "time_offset": 1e-9,
 }  # name of the field, seconds per unit
 FARTHEST_M, LONGEST_S = 1e4, 10.0  # no point is farther away, no sweep longer
+LARGEST_S, NANOSECONDS = 1e12, 1_000_000_000  # times above are in nanoseconds
 MOMENT_NS = 2_000_000  # points no further apart in time are moved together
 
 
 def points_of(message: Any, where: str) -> tuple[Array, Array]:
     """Points [n, 3] in meters, frame of the message, and when each was measured, s after its stamp; all finite.
 
-    Without a field of times they are zero: `time` (s, Velodyne), `t` (ns, Ouster), `offset_time` (ns, Livox).
+    Without a field of times they are zero: `time` (s, Velodyne), `t` (ns, Ouster), `offset_time` (ns, Livox), or
+    `timestamp` in float64, of the clock itself (s or ns; Livox, Hesai, RoboSense).
     """
     fields = {field.name: field for field in message.fields}
     step, width, height = int(message.point_step), int(message.width), int(message.height)
@@ -59,10 +61,30 @@ def points_of(message: Any, where: str) -> tuple[Array, Array]:
     points = np.stack([column(name) for name in "xyz"], axis=-1)
     timed = next((name for name in _TIMES if name in fields), None)
     seconds = np.zeros(len(points)) if timed is None else column(timed) * _TIMES[timed]
+    if timed is None and "timestamp" in fields and _TYPES.get(fields["timestamp"].datatype) == "f8":
+        seconds = _after_stamp(column("timestamp"), message.header.stamp)
     with np.errstate(invalid="ignore"):
         sound = (np.abs(points) < FARTHEST_M).all(axis=1) & (np.abs(seconds) < LONGEST_S)
     sound &= (points != 0).any(axis=1)  # nothing came back
     return points[sound], seconds[sound]
+
+
+def _after_stamp(times: Array, stamp: Any) -> Array:
+    """Seconds after the stamp of a message, of times by its clock: seconds, or nanoseconds by their size.
+
+    Times that are after the stamp already stay; those of another clock say nothing.
+    """
+    known = times[np.isfinite(times)]
+    if not len(known):
+        return np.zeros(len(times))
+    if np.median(known) > LARGEST_S:
+        seconds = (times - (int(stamp.sec) * NANOSECONDS + int(stamp.nanosec))) / NANOSECONDS
+    else:
+        seconds = (times - int(stamp.sec)) - int(stamp.nanosec) / NANOSECONDS
+    for after in (seconds, times):
+        if abs(np.median(after[np.isfinite(after)])) < LONGEST_S:
+            return after
+    return np.zeros(len(times))
 
 
 def as_of(

@@ -76,6 +76,24 @@ def test_times(name: str, kind: str, values: list[float]) -> None:
     np.testing.assert_allclose(seconds, np.array(values) * unit, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([1_700_000_000.25 + t for t in (0.0, 0.05, 0.1, 0.15)], (0.0, 0.05, 0.1, 0.15)),
+        ([1.70000000025e18 + t for t in (0.0, 5e7, 1e8, 1.5e8)], (0.0, 0.05, 0.1, 0.15)),
+        ([0.0, 0.05, 0.1, 0.15], (0.0, 0.05, 0.1, 0.15)),
+        ([500.0, 500.05, 500.1, 500.15], (0.0, 0.0, 0.0, 0.0)),
+    ],
+    ids=["seconds", "nanoseconds", "after the stamp", "another clock"],
+)
+def test_times_of_the_clock_itself(values: list[float], expected: tuple[float, ...]) -> None:
+    message = cloud(extra={"timestamp": ("f8", values)})
+    message.header = SimpleNamespace(stamp=SimpleNamespace(sec=1_700_000_000, nanosec=250_000_000))
+    points, seconds = points_of(message, "here")
+    assert len(points) == 4
+    np.testing.assert_allclose(seconds, expected, atol=1e-6)
+
+
 def test_points_that_are_none_are_left_out() -> None:
     message = cloud(kind="f8", extra={"time": ("f8", [0.0, np.nan, 0.1, 1e30])})
     points, seconds = points_of(message, "here")
