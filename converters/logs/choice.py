@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
 from duagc.converters.layouts.ros_images import is_depth
-from duagc.converters.logs.files import Log
+from duagc.converters.logs.files import Log, is_below
 from duagc.pipeline.base.errors import DuagError, closest
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -16,7 +17,12 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
 VIDEO = ("CompressedVideo", "FFMPEGPacket")  # how the names of schemas of video end
 LEFT, RIGHT = ("left", "infra1", "cam0"), ("right", "infra2", "cam1")
-REGISTERED = ("aligned_depth_to_color", "depth_registered", "registered", "aligned")
+REGISTERED = (
+    "aligned_depth_to_color",
+    "depth_registered",
+    "registered",
+    "aligned",
+)  # words of a topic's parts
 
 
 @dataclass(frozen=True)
@@ -139,7 +145,7 @@ class Chooser:
         if len(found) == 1:
             return Choice(found[0], f"the only images that are {kind}", tuple(found))
         for hint in hints:
-            some = [topic for topic in found if hint in topic.lower()]
+            some = [topic for topic in found if _has(topic, hint)]
             if len(some) == 1:
                 return Choice(some[0], f"the only {kind} images with {hint!r} in their name", tuple(found))
         if not found:
@@ -157,12 +163,19 @@ class Chooser:
         return Choice(wanted, "given", tuple(known))
 
 
+def _has(topic: str, hint: str) -> bool:
+    """Whether a hint is in the name of a topic; one of registration only as whole words ("unregistered" is none)."""
+    if hint not in REGISTERED:
+        return hint in topic.lower()
+    return re.search(rf"(?<![a-z0-9]){hint}(?![a-z0-9])", topic.lower()) is not None
+
+
 def video_words(log: Log, namespace: str) -> str:
     """What to add to a complaint that there are no images: topics that hold them as video."""
     found = sorted(
         f"{t.name} ({t.schema})"
         for t in log.topics.values()
-        if t.schema.endswith(VIDEO) and t.count and t.name.startswith(f"{namespace.rstrip('/')}/")
+        if t.schema.endswith(VIDEO) and t.count and is_below(t.name, namespace)
     )
     if not found:
         return ""
@@ -171,10 +184,14 @@ def video_words(log: Log, namespace: str) -> str:
     )
 
 
+def _parts(topic: str) -> tuple[str, ...]:
+    return PurePosixPath(topic.lstrip("/")).parts
+
+
 def shared_parts(a: str, b: str) -> int:
     """How many parts two topics have in common from the left."""
     count = 0
-    for x, y in zip(PurePosixPath(a).parts[1:], PurePosixPath(b).parts[1:], strict=False):
+    for x, y in zip(_parts(a), _parts(b), strict=False):
         if x != y:
             break
         count += 1

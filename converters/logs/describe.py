@@ -100,7 +100,7 @@ def namespaces(log: Log) -> list[str]:
     if chooser.color().topic and chooser.depth().topic:
         return []
     spaces = []
-    for name in sorted({f"/{topic.split('/')[1]}" for topic in chooser.images}):
+    for name in sorted({f"/{topic.lstrip('/').split('/')[0]}" for topic in chooser.images}):
         inner = Chooser(log, name)
         if inner.color().topic and inner.depth().topic:
             spaces.append(name)

@@ -66,9 +66,7 @@ class Log:
     def of_type(self, *types: str, below: str = "") -> list[str]:
         """Names of topics of these types that have messages, in a namespace."""
         return sorted(
-            t.name
-            for t in self.topics.values()
-            if t.type in types and t.count and t.name.startswith(f"{below.rstrip('/')}/")
+            t.name for t in self.topics.values() if t.type in types and t.count and is_below(t.name, below)
         )
 
     def entries(self, *topics: str, heads: Collection[str] = ()) -> Iterator[Entry]:
@@ -86,6 +84,17 @@ class Log:
         if entry is None:
             raise DuagError(f"{self.name}: {topic} has no message, expected one")
         return entry.read()
+
+
+def is_below(topic: str, namespace: str) -> bool:
+    """Whether a topic is in a namespace; in ROS 1 either may come without the slash before it.
+
+    Args:
+        topic: its name.
+        namespace: empty: that of all.
+    """
+    space = namespace.strip("/")
+    return not space or topic.lstrip("/").startswith(f"{space}/")
 
 
 def open_log(paths: Sequence[Path], name: str = "") -> Log:

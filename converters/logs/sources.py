@@ -62,7 +62,7 @@ def sources_of(src: Path, options: Mapping[str, Any]) -> list[Source]:
     if src.suffix == ".toml":
         return _from_file(src, options)
     settings = options_of(LogOptions, options, "ros")
-    spaces = [text.strip() for text in settings.namespaces.split(",") if text.strip()]
+    spaces = [f"/{text.strip().lstrip('/')}" for text in settings.namespaces.split(",") if text.strip()]
     if spaces or settings.pieces:
         paths = tuple(logs_in(src))
         parts = [(paths, space, space) for space in spaces or [""]]

@@ -1,0 +1,32 @@
+"""Names of topics as recorders of ROS 1 may write them: without the slash before them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from duagc.converters import registry
+from duagc.converters.logs.files import is_below
+from duagc.pipeline.recording import info
+from tests.fixtures.ros_bags import Ros, still
+
+
+def test_topics_without_a_leading_slash_are_found(tmp_path: Path) -> None:
+    r = Ros(1)
+    rows = [(topic.lstrip("/"), at, message) for topic, at, message in still(r)]
+    registry.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
+    assert info(tmp_path / "rec")["robots"]["alpha"]["frames"] > 0
+
+
+def test_namespaces_may_be_given_without_a_slash(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = [(f"/{robot}{topic}", at, message) for robot in ("r1", "r2") for topic, at, message in still(r)]
+    bag = r.write(tmp_path / "bag", sorted(rows, key=lambda row: row[1]), "sqlite3")
+    registry.convert("ros", bag, tmp_path / "rec", options=["namespaces=r1, /r2"])
+    assert sorted(info(tmp_path / "rec")["robots"]) == ["r1", "r2"]
+
+
+def test_a_namespace_is_no_beginning_of_a_word() -> None:
+    assert is_below("/jackal/color", "/jackal")
+    assert is_below("jackal/color", "/jackal/")
+    assert not is_below("/jackal2/color", "/jackal")
+    assert is_below("/color", "")
