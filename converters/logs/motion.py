@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from duagc.converters.layouts.tum_layout import Poses
 from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
 from duagc.converters.logs.files import Log
-from duagc.converters.logs.frames import TF_TYPES, Transforms, frame_name, pose_matrix, transforms_in
+from duagc.converters.logs.frames import (
+    TF_TYPES,
+    Transforms,
+    Unsound,
+    body_axes_of_camera,
+    frame_name,
+    transforms_in,
+)
 from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError, closest
@@ -84,6 +91,7 @@ class _PoseReadings:
         self._frames = tuple(frame_name(f) for f in frames)
         self._seen: set[str] = set()
         self._stamps, self._poses, self._body = array("q"), array("d"), frames[1] if frames else ""
+        self.world, self.unsound = frames[0] if frames else "", Unsound()
 
     def take(self, entry: Entry) -> None:
         if self._frames:
@@ -95,12 +103,15 @@ class _PoseReadings:
         else:
             pose = m.pose.pose if hasattr(m.pose, "pose") else m.pose
             position, orientation = pose.position, pose.orientation
-        self._body = getattr(m, "child_frame_id", "")
-        if np.isfinite([position.x, position.y, position.z]).all():
-            self._add(self._time_ns(entry), pose_matrix(position, orientation, where))
+        self._body, self.world = getattr(m, "child_frame_id", ""), m.header.frame_id
+        if not np.isfinite([position.x, position.y, position.z]).all():
+            return
+        T = self.unsound.matrix(position, orientation, where, ("", ""))
+        if T is not None:
+            self._add(self._time_ns(entry), T)
 
     def _take_transforms(self, entry: Entry) -> None:
-        for stamp, parent, child, T in transforms_in(entry, f"{self._name}: {self.topic}"):
+        for stamp, parent, child, T in transforms_in(entry, f"{self._name}: {self.topic}", self.unsound):
             self._seen.add(f"{parent} {child}")
             if (parent, child) == self._frames:
                 self._add(sound_time(stamp, self.topic) if self._of_header else self._time_ns(entry), T)
@@ -111,6 +122,8 @@ class _PoseReadings:
 
     def result(self) -> tuple[Poses, str]:
         """Poses in order of time, of equal times the last one, and the frame of the body."""
+        if not self._stamps and (why := self.unsound.broken.get(self._frames or ("", ""))):  # type: ignore[arg-type]
+            raise DuagError(why)
         if self._frames and not self._stamps:
             wanted = " ".join(self._frames)
             raise DuagError(
@@ -147,7 +160,7 @@ class MotionReader:
             DuagError: a topic that was asked for is not there, or the file of true poses cannot be read.
         """
         self._log, self._settings, self._transforms = log, settings, transforms
-        self.name, self.color_frame = log.name, color_frame
+        self.name, self.color_frame, self.warnings = log.name, color_frame, transforms.warnings
         self.take: list[tuple[str, Callable[[Entry], None]]] = []
         s = settings
         self._imu = self._odometry = self._truth = None
@@ -185,10 +198,14 @@ class MotionReader:
             raise DuagError(
                 f"{self.name}: messages of odometry name no body frame, expected --set {setting}='x y z qw qx qy qz'"
             )
-        frame = frame_name(
-            (self._settings.truth_frame if option == "truth" else "") or frame_in_log or self.color_frame
-        )
-        if frame in ("camera", frame_name(self.color_frame)):
+        said = frame_name(self._settings.truth_frame) if option == "truth" else ""
+        if not said and not frame_in_log:
+            self.warnings.append(
+                "true poses name no body: taken as those of the color camera, z forward; expected "
+                f"truth_frame=camera if they are, else truth_frame=FRAME or {setting}='x y z qw qx qy qz'"
+            )
+        frame = said or frame_name(frame_in_log or self.color_frame)
+        if said == "camera" or frame == frame_name(self.color_frame):
             return np.eye(4)
         T = self._transforms.lookup(frame, self.color_frame)
         if T is None:
@@ -197,6 +214,7 @@ class MotionReader:
                 f"{self.name}: {option} is of {frame!r}, and /tf_static does not tie it to {self.color_frame!r}; "
                 f"expected --set {setting}='x y z qw qx qy qz'{camera}"
             )
+        self.warnings += body_axes_of_camera(self.color_frame, frame, T, setting)
         return T
 
     def truth(self) -> CameraPoses | None:
@@ -205,16 +223,23 @@ class MotionReader:
             found, body = self._truth_file, ""
         elif self._truth:
             found, body = self._truth.result()
+            self.warnings += self._truth.unsound.words(self._truth.topic, "true poses")
         else:
             return None
         stamps = found.stamps_ns + round(self._settings.truth_offset_s * NANOSECONDS)
         return CameraPoses(replace(found, stamps_ns=stamps), self._body_camera("truth", body))
+
+    @property
+    def truth_world(self) -> str:
+        """Frame in which the messages of true poses are; empty: not said."""
+        return frame_name(self._truth.world) if self._truth else ""
 
     def odometry(self) -> CameraPoses | None:
         """Poses of the color camera by another odometry; None if none was asked for."""
         if not self._odometry:
             return None
         found, body = self._odometry.result()
+        self.warnings += self._odometry.unsound.words(self._odometry.topic, "poses")
         return CameraPoses(found, self._body_camera("odometry", body))
 
     def imu(self) -> Imu | None:
@@ -228,6 +253,11 @@ class MotionReader:
             raise DuagError(
                 f"{self.name}: {topic} holds numbers that are not finite, expected rad/s and m/s^2"
             )
+        if not values[:, :3].any():
+            self.warnings.append(
+                f"{topic}: all turning rates are zero, as of an accelerometer alone; left out"
+            )
+            return None
         if self._settings.T_color_imu:
             T = extrinsics_of("T_color_imu", self._settings.T_color_imu)
         else:
@@ -238,6 +268,7 @@ class MotionReader:
                     f"{self.color_frame!r}; expected --set T_color_imu='x y z qw qx qy qz'"
                 )
             T = found
+            self.warnings += body_axes_of_camera(self.color_frame, frame, T, "T_color_imu")
         return Imu(times, values, T)
 
 
