@@ -297,12 +297,14 @@ class RosCamera:
 
     Attributes:
         fisheye: whether the distortion is that of the equidistant model.
+        is_straight: whether it says that there is no distortion, by numbers that are all zero.
     """
 
     camera: PinholeCamera
     distortion: tuple[float, ...]
     fisheye: bool
     frame_id: str
+    is_straight: bool = False
 
     @staticmethod
     def of(message: Any, rectified: bool, where: str) -> RosCamera:
@@ -340,7 +342,7 @@ class RosCamera:
             (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
         )
         if not np.any(D):
-            return RosCamera(camera, (), False, message.header.frame_id)
+            return RosCamera(camera, (), False, message.header.frame_id, len(D) > 0)
         fisheye = model in FISHEYE
         lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
         if not fisheye and model not in POLYNOMIAL:

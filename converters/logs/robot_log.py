@@ -18,19 +18,20 @@ from duagc.converters.layouts.validity import of_maps
 from duagc.converters.logs.cameras import (
     CameraWatch,
     is_rectified,
-    realsense_extrinsics,
     stated,
     stated_camera,
 )
-from duagc.converters.logs.choice import REGISTERED, Chooser, video_words
+from duagc.converters.logs.choice import Chooser, video_words
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
 from duagc.converters.logs.files import Log
-from duagc.converters.logs.frames import Transforms
+from duagc.converters.logs.frames import Transforms, body_axes_of_camera
 from duagc.converters.logs.gather import gathered
-from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
+from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader
 from duagc.converters.logs.options import LogOptions
+from duagc.converters.logs.registration import View, check_infos, extrinsics
+from duagc.converters.logs.stamps import sound_stamps
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
@@ -58,7 +59,7 @@ class RobotLog:
         self._rate, self._origin_ns = 0.0, 0  # of the clock, see `settle_drift`
         # by topic of a CameraInfo: the camera of its first message, and whether its images are rectified
         self._cameras: dict[str, tuple[RosCamera, bool]] = {}
-        self.transforms = Transforms(log, self.namespace)
+        self.transforms = Transforms(log, self.namespace, self.warnings)
         self._choose()
 
     def _choose(self) -> None:
@@ -70,18 +71,22 @@ class RobotLog:
             raise DuagError(f"{self.name}: found no topic of images{where}, expected color and depth{video}")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
-        self.color_camera = self._camera(self.color, "color_info", chooser)
+        color = self._view(self.color, "color_info", chooser)
+        self.color_camera = color.camera
         self._motion = MotionReader(
             self.log, s, self.transforms, self.color_camera.frame_id, time_ns=self.time_ns
         )
         self.T_color_depth: Array | None = None
-        self.derived = self._derived(chooser) if s.depth_from != "image" else None
+        self._has_own_info = False  # depth has, not that of color
+        self.derived = self._derived(chooser, color) if s.depth_from != "image" else None
         if self.derived:
             self.camera, self.depth_scale = self.derived.camera, self.derived.scale
             return
         self.camera = self.color_camera.camera
-        self.depth_camera = self._camera(self.depth, "depth_info", chooser)
-        self.T_color_depth = self._extrinsics()
+        depth = self._view(self.depth, "depth_info", chooser)
+        check_infos(color, depth, s, self.name)
+        self.depth_camera, self._has_own_info = depth.camera, depth.info not in ("", color.info)
+        self.T_color_depth = extrinsics(self.log, color, depth, self.transforms, settings=s)
         sensor = self.depth_camera.camera
         if self._is_depth_rectified:
             self.camera = sensor
@@ -96,15 +101,15 @@ class RobotLog:
         self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
         self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE
 
-    def _derived(self, chooser: Chooser) -> Derived:
+    def _derived(self, chooser: Chooser, color: View) -> Derived:
         """Depth of a stereo pair or of a LiDAR."""
         s = self.settings
         if s.depth_from == "stereo":
-            color = self.color, self._info_unless_stated("color_info", chooser), self.color_camera
-            right = self._info_unless_stated("depth_info", chooser)
-            other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
+            right = self._view(self.depth, "depth_info", chooser)
+            check_infos(color, right, s, self.name)
+            eyes = [(view.topic, view.info, view.camera) for view in (color, right)]
             return stereo_of(
-                self.log, color, other, is_rectified(self.color), transforms=self.transforms, settings=s
+                self.log, eyes[0], eyes[1], is_rectified(self.color), transforms=self.transforms, settings=s
             )
         if s.max_difference_s == 0:
             self.settings = s.model_copy(update={"max_difference_s": HALF_TURN_S})
@@ -113,8 +118,12 @@ class RobotLog:
             self.warnings.append(
                 "sweeps hold what the LiDAR moved meanwhile; expected --set imu=TOPIC or odometry=TOPIC to take it out"
             )
-        camera = self.color, self.color_camera
-        return sweeps_of(self.log, camera, self.depth, self.transforms, motion=motion, settings=s)
+        camera, frame = (self.color, self.color_camera), self.log.first(self.depth).header.frame_id
+        sweeps = sweeps_of(self.log, camera, self.depth, self.transforms, motion=motion, settings=s)
+        if not s.T_color_depth:
+            T = sweeps.lidar.T_camera_lidar
+            self.warnings += body_axes_of_camera(self.color_camera.frame_id, frame, T, "T_color_depth")
+        return sweeps
 
     @property
     def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
@@ -137,30 +146,21 @@ class RobotLog:
         found = gathered(self.log, groups, self.time_ns)
         return self.derived.check([(g[self.color].read(), g[self.depth].read()) for g in found])
 
-    def _info(self, topic: str, option: str, chooser: Chooser) -> str:
-        """The CameraInfo of an image topic."""
-        return chooser.info(option, topic).required(self.log, option)
-
-    def _info_unless_stated(self, option: str, chooser: Chooser) -> str:
-        """The CameraInfo of the color or the depth topic; empty where the options state the camera."""
-        if stated(self.settings, option, bool(chooser.infos)):
-            return ""
-        return self._info(self.color if option == "color_info" else self.depth, option, chooser)
-
-    def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
-        """Camera of an image topic: as the options state it, else by its CameraInfo."""
+    def _view(self, topic: str, option: str, chooser: Chooser) -> View:
+        """An image topic with its camera: as the options state it, else by its CameraInfo."""
+        image, where = chooser.images[topic], f"{self.name}: {topic}"
         if text := stated(self.settings, option, bool(chooser.infos)):
-            return stated_camera(text, chooser.images[topic], f"{self.name}: {topic}")
-        chosen = self._info(topic, option, chooser)
+            return View(topic, image.header.frame_id, "", stated_camera(text, image, where))
+        chosen = chooser.info(option, topic).required(self.log, option)
         camera = RosCamera.of(self.log.first(chosen), is_rectified(topic), f"{self.name}: {chosen}")
         self._cameras[chosen] = (camera, is_rectified(topic))
-        found = size_of(chooser.images[topic], f"{self.name}: {topic}")
+        found = size_of(image, where)
         expected = camera.camera.width, camera.camera.height
         if found != expected:
             raise DuagError(
-                f"{self.name}: {topic} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in {chosen}"
+                f"{where} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in {chosen}"
             )
-        return camera
+        return View(topic, image.header.frame_id, chosen, camera)
 
     @cached_property
     def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
@@ -172,7 +172,8 @@ class RobotLog:
     def _is_depth_rectified(self) -> bool:
         """Whether depth is registered to color as it looks without distortion, while color is recorded with it."""
         registered = self.derived is None and self.T_color_depth is None and self.settings.undistort
-        return registered and is_rectified(self.depth) and bool(self.color_camera.distortion)
+        stated_so = self._has_own_info and self.depth_camera.is_straight
+        return registered and (is_rectified(self.depth) or stated_so) and bool(self.color_camera.distortion)
 
     @cached_property
     def valid(self) -> Mask | None:
@@ -186,41 +187,16 @@ class RobotLog:
     def depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Where in the depth images every pixel of their pinhole lies; None if they need not be undistorted.
 
-        Depth that is registered has the distortion of color, unless it is rectified; that of another camera its own.
+        Depth that is registered has the distortion of color, unless it is rectified or color is; that of another camera
+        its own.
         """
         if self._is_depth_rectified:
             return None
+        if self.T_color_depth is None and self._has_own_info and not self.color_camera.distortion:
+            return self.depth_camera.maps(self.camera)
         return self.color_maps if self.T_color_depth is None else self.depth_camera.maps()
 
-    # --- where the cameras are
-
-    def _extrinsics(self) -> Array | None:
-        """T_color_depth [4, 4]; None if depth is registered already."""
-        s, color, depth = self.settings, self.color_camera, self.depth_camera
-        same = color.camera == depth.camera and color.frame_id == depth.frame_id != ""
-        named = any(hint in self.depth.lower() for hint in REGISTERED)
-        if s.registered == "yes" or (s.registered == "auto" and not s.T_color_depth and (same or named)):
-            if (color.camera.width, color.camera.height) != (depth.camera.width, depth.camera.height):
-                raise DuagError(
-                    f"{self.name}: {self.depth} is {depth.camera.width}x{depth.camera.height}, expected "
-                    f"{color.camera.width}x{color.camera.height} of color that it is registered to"
-                )
-            return None
-        if s.T_color_depth:
-            return extrinsics_of("T_color_depth", s.T_color_depth)
-        named_frames = bool(color.frame_id and depth.frame_id)
-        T = (
-            self.transforms.lookup(color.frame_id, depth.frame_id)
-            if named_frames
-            else realsense_extrinsics(self.log, self.color, self.depth, self.name)
-        )
-        if T is None:
-            raise DuagError(
-                f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, color from {color.frame_id!r}, and "
-                f"/tf_static does not tie them{self.transforms.moving_words()}; expected --set T_color_depth="
-                "'x y z qw qx qy qz' or registered=yes"
-            )
-        return T
+    # --- what moved
 
     @cached_property
     def imu(self) -> Imu | None:
@@ -311,22 +287,9 @@ class RobotLog:
     @cached_property
     def pairs(self) -> dict[int, int | None]:
         """Time of a color image -> time of its depth image; None: none is near, and the camera is followed by color."""
-        stamps = {topic: times.tolist() for topic, times in self._seen.items()}
-        for topic, times in stamps.items():
-            if times != sorted(times):
-                self.warnings.append(f"{topic}: times go backwards; images are taken in order of time")
-            if len(set(times)) < len(times):
-                self.warnings.append(
-                    f"{topic}: {len(times) - len(set(times))} images repeat a time; left out"
-                )
-            if not any(times):
-                raise DuagError(
-                    f"{self.name}: {topic}: all times are zero, expected times, or --set time_source=log"
-                )
-            if unset := times.count(0):
-                self.warnings.append(f"{topic}: {unset} images without a time; left out")
         listed = {
-            topic: [Listed(t, Path()) for t in sorted(set(times)) if t] for topic, times in stamps.items()
+            topic: [Listed(t, Path()) for t in sound_stamps(self.name, topic, times, self.warnings)]
+            for topic, times in self._seen.items()
         }
         settings = self.settings
         if self.derived is not None and settings.association == "all":

@@ -27,7 +27,9 @@ from tests.fixtures.ros_bags import (
     T_COLOR_DEPTH,
     Ros,
     scene,
+    still,
 )
+from tests.fixtures.ros_clocks import moved_headers
 
 
 @pytest.mark.parametrize(
@@ -107,6 +109,24 @@ def test_times(tmp_path: Path) -> None:
         assert [log.frame(i).stamp_ns for i in range(FRAMES)] == [
             START_NS + (i + 1) * STEP_NS for i in range(FRAMES)
         ]
+
+
+@pytest.mark.parametrize("late", [(9,), tuple(range(9, 15))], ids=["one image", "a clock that was set back"])
+def test_a_clock_that_was_set_back_is_refused(tmp_path: Path, late: tuple[int, ...]) -> None:
+    """Its frames would be mixed with those of before; a single image that came late is not."""
+    r, rows = Ros(1), []
+    for topic, log_ns, message in still(r, frames=15):
+        k = (log_ns - START_NS) // STEP_NS - 1
+        if "image_raw" in topic and k in late:
+            moved_headers(r, [(topic, log_ns, message)], -STEP_NS * 17 // 2)
+        rows.append((topic, log_ns, message))
+    bag = r.write(tmp_path / "bag", rows, "plain")
+    if len(late) == 1:
+        registry.convert("ros", bag, tmp_path / "rec")
+        return
+    with pytest.raises(DuagError, match=r"times go back by 0\.375 s to 1700000000\.075 s, .*time_source=log"):
+        registry.convert("ros", bag, tmp_path / "rec")
+    registry.convert("ros", bag, tmp_path / "rec", options=["time_source=log"])
 
 
 def test_a_frame_tied_to_nothing_needs_extrinsics(tmp_path: Path) -> None:

@@ -1,0 +1,50 @@
+"""Times of the images of a topic in order of recording: what can be used of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from duagc.converters.logs.entries import NANOSECONDS
+from duagc.pipeline.base.errors import DuagError
+
+MOST_STEPS_BACK = (
+    5.0  # intervals of frames that transport may exchange; a clock that was set back goes further
+)
+
+
+def sound_stamps(name: str, topic: str, times: Sequence[int], warnings: list[str]) -> list[int]:
+    """The times in their order, each once, without those that are zero.
+
+    Args:
+        name: of the log.
+        topic: of the images.
+        times: ns, in order of recording.
+        warnings: gets what was left out.
+    Raises:
+        DuagError: all times are zero, or the clock was set back.
+    """
+    if not any(times):
+        raise DuagError(f"{name}: {topic}: all times are zero, expected times, or --set time_source=log")
+    if list(times) != sorted(times):
+        _check_steps_back(f"{name}: {topic}", times)
+        warnings.append(f"{topic}: times go backwards; images are taken in order of time")
+    if len(set(times)) < len(times):
+        warnings.append(f"{topic}: {len(times) - len(set(times))} images repeat a time; left out")
+    if unset := list(times).count(0):
+        warnings.append(f"{topic}: {unset} images without a time; left out")
+    return [time for time in sorted(set(times)) if time]
+
+
+def _check_steps_back(where: str, times: Sequence[int]) -> None:
+    """Refuse times of a clock that was set back: frames of before and after it would be mixed."""
+    known = np.array([time for time in times if time], dtype=np.int64)
+    back = np.maximum.accumulate(known) - known
+    worst = int(back.argmax())
+    interval = float(np.median(np.diff(np.unique(known)))) if len(known) > 1 else 0.0
+    if int((back > MOST_STEPS_BACK * interval).sum()) > 1:  # a single image may come late
+        raise DuagError(
+            f"{where}: times go back by {back[worst] / NANOSECONDS:.3f} s to {known[worst] / NANOSECONDS:.3f} s, as "
+            "of a clock that was set back; expected times in the order of recording, or --set time_source=log"
+        )

@@ -1,0 +1,194 @@
+"""Whether depth counts as seen from the color camera: by frames and cameras, and by names only with them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from duagc.converters import registry
+from duagc.converters.layouts.ros_images import RosCamera
+from duagc.converters.logs.choice import Chooser
+from duagc.converters.logs.files import open_log
+from duagc.converters.logs.registration import is_named_registered
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.recording.read import LogFile
+from tests.fixtures.ros_bags import SMALL, START_NS, Ros, still
+
+COLOR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame"
+LENS = (0.3, -0.2, 0.0, 0.0, 0.0)
+RAW = "/camera/depth/image_rect_raw"
+
+
+def tied(r: Ros, a: str, b: str, offset: tuple[float, float, float]) -> tuple[str, int, Any]:
+    T = se3.from_rotation_translation(np.eye(3), offset)
+    rows = [
+        r.transform(START_NS, "base_link", b, np.eye(4)),
+        r.transform(START_NS, "base_link", a, T),
+    ]
+    return "/tf_static", START_NS, r.tf(*rows)
+
+
+def described(recording: Path) -> dict[str, Any]:
+    return json.loads((recording / "recording.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("info", "frame", "lost", "option"),
+    [
+        ("/camera/color/camera_info", COLOR_FRAME, RAW, "depth"),
+        ("/camera/depth/camera_info", DEPTH_FRAME, "/camera/color/image_raw", "color"),
+    ],
+)
+def test_one_camera_info_is_not_that_of_two_cameras(
+    tmp_path: Path, info: str, frame: str, lost: str, option: str
+) -> None:
+    r = Ros(2)
+    infos = {info: r.info(START_NS, frame, SMALL)}
+    rows = still(r, ("/camera/color/image_raw", COLOR_FRAME), (RAW, DEPTH_FRAME), infos)
+    bag = r.write(tmp_path / "bag", [tied(r, COLOR_FRAME, DEPTH_FRAME, (0.06, 0, 0)), *rows], "sqlite3")
+    with pytest.raises(
+        DuagError, match=f"{lost} of .* no CameraInfo of its own, .*--set {option}_info=TOPIC"
+    ):
+        registry.convert("ros", bag, tmp_path / "rec")
+    registry.convert("ros", bag, tmp_path / "rec", options=[f"{option}_camera=42 42 31.5 23.5"])
+    assert described(tmp_path / "rec")["robots"]["alpha"]["sensors"]["depth"].endswith("by the converter")
+
+
+def test_the_cameras_of_one_frame_may_share_their_camera_info(tmp_path: Path) -> None:
+    r = Ros(2)
+    infos = {"/camera/color/camera_info": r.info(START_NS, "c", SMALL)}
+    bag = r.write(tmp_path / "bag", still(r, depth=(RAW, "c"), infos=infos), "sqlite3")
+    registry.convert("ros", bag, tmp_path / "rec")
+    assert described(tmp_path / "rec")["robots"]["alpha"]["sensors"]["depth"] == "registered"
+
+
+def test_depth_aligned_to_another_camera_is_registered(tmp_path: Path) -> None:
+    r, infrared = Ros(2), PinholeCamera(64, 48, 42.0, 42.0, 31.5, 23.5)
+    infos = {
+        "/camera/color/camera_info": r.info(START_NS, COLOR_FRAME, SMALL),
+        "/camera/aligned_depth_to_infra1/camera_info": r.info(START_NS, "infra1_optical", infrared),
+    }
+    depth = "/camera/aligned_depth_to_infra1/image_raw", "infra1_optical"
+    rows = still(r, ("/camera/color/image_raw", COLOR_FRAME), depth, infos)
+    bag = r.write(tmp_path / "bag", [tied(r, COLOR_FRAME, "infra1_optical", (0.06, 0, 0)), *rows], "sqlite3")
+    registry.convert("ros", bag, tmp_path / "rec")
+    assert described(tmp_path / "rec")["robots"]["alpha"]["sensors"]["depth"].endswith("by the converter")
+    assert described(tmp_path / "rec")["warnings"] == []
+
+
+@pytest.mark.parametrize(("focal", "count"), [(60.3, 1), (66.0, 0)])
+def test_a_name_counts_with_the_camera_of_color(tmp_path: Path, focal: float, count: int) -> None:
+    """Older drivers give aligned depth a frame of its own that nothing ties."""
+    r = Ros(2)
+    infos = {
+        "/camera/color/camera_info": r.info(START_NS, COLOR_FRAME, SMALL),
+        "/camera/aligned_depth_to_color/camera_info": r.info(
+            START_NS, "aligned", PinholeCamera(64, 48, focal, focal, 31.5, 23.5)
+        ),
+    }
+    depth = "/camera/aligned_depth_to_color/image_raw", "aligned"
+    bag = r.write(
+        tmp_path / "bag", still(r, ("/camera/color/image_raw", COLOR_FRAME), depth, infos), "sqlite3"
+    )
+    if not count:
+        with pytest.raises(DuagError, match="/tf_static does not tie them"):
+            registry.convert("ros", bag, tmp_path / "rec")
+        return
+    registry.convert("ros", bag, tmp_path / "rec")
+    assert described(tmp_path / "rec")["robots"]["alpha"]["sensors"]["depth"] == "registered"
+
+
+@pytest.mark.parametrize(
+    ("topic", "expected"),
+    [
+        ("/camera/aligned_depth_to_color/image_raw", True),
+        ("/camera/depth_registered/sw_registered/image_rect_raw", True),
+        ("/camera/depth/aligned/image", True),
+        ("/camera/aligned_depth_to_infra1/image_raw", False),
+        ("/camera/unregistered/image_raw", False),
+        ("/misaligned/depth/image_raw", False),
+    ],
+)
+def test_names_of_registered_depth(topic: str, expected: bool) -> None:
+    assert is_named_registered(topic) == expected
+
+
+def test_unregistered_depth_is_not_chosen_for_its_name(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = still(r, depth=("/camera/unregistered/depth", "c"))
+    rows += [row for row in still(r, depth=("/camera/depth/image_raw", "c")) if "depth/image" in row[0]]
+    bag = r.write(tmp_path / "bag", sorted(rows, key=lambda row: row[1]), "sqlite3")
+    with open_log([bag]) as log:
+        choice = Chooser(log).depth()
+    assert choice.topic == ""
+    assert len(choice.candidates) == 2
+
+
+def test_depth_with_a_lens_of_its_own_fits_rectified_color(tmp_path: Path) -> None:
+    """Color is rectified by name; the CameraInfo of the registered depth says that it is not."""
+    r = Ros(2)
+    for name, lens in (("bent", LENS), ("straight", ())):
+        infos = {
+            "/rgb/camera_info": r.info(START_NS, "rgb", SMALL, LENS),
+            "/depth_to_rgb/camera_info": r.info(START_NS, "rgb", SMALL, lens),
+        }
+        rows = still(r, ("/rgb/image_rect_color", "rgb"), ("/depth_to_rgb/image_raw", "rgb"), infos)
+        registry.convert("ros", r.write(tmp_path / name, rows, "sqlite3"), tmp_path / f"rec_{name}")
+    (bent, color), (straight, same) = (first(tmp_path / f"rec_{name}") for name in ("bent", "straight"))
+    np.testing.assert_array_equal(color, same)
+    maps = RosCamera(SMALL, LENS, False, "rgb").maps()
+    assert maps is not None
+    np.testing.assert_array_equal(bent, cv2.remap(straight, *maps, cv2.INTER_NEAREST))
+    assert (bent != straight).any()
+
+
+def test_depth_that_says_it_has_no_distortion_is_not_undistorted(tmp_path: Path) -> None:
+    r = Ros(2)
+    infos = {
+        "/oak/rgb/camera_info": r.info(START_NS, "rgb", SMALL, LENS),
+        "/oak/stereo/camera_info": r.info(START_NS, "rgb", SMALL),
+    }
+    rows = still(r, ("/oak/rgb/image_raw", "rgb"), ("/oak/stereo/image_raw", "rgb"), infos)
+    registry.convert("ros", r.write(tmp_path / "bag", rows, "sqlite3"), tmp_path / "rec")
+    depth, _ = first(tmp_path / "rec")
+    expected = np.full((48, 64), 2.0)
+    expected[:, :32] = 1.0
+    np.testing.assert_allclose(depth[depth > 0], expected[depth > 0], atol=1e-6)
+    assert (depth > 0).mean() > 0.8
+
+
+def first(recording: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and color of the first frame."""
+    with open_rgbd(recording / "alpha.mcap") as log:
+        frame = log.frame(0)
+        return frame.depth, frame.color
+
+
+@pytest.mark.parametrize(
+    ("frames", "offset", "count"),
+    [
+        (("rgb_link", "depth_link"), (0.0, 0.05, 0.0), 1),
+        (("rgb_link", "depth_link"), (0.032, 0.002, -0.004), 0),
+        (("rgb_optical", "depth_optical"), (0.0, 0.05, 0.0), 0),
+    ],
+)
+def test_frames_that_may_have_x_forward_are_warned_of(
+    tmp_path: Path, frames: tuple[str, str], offset: tuple[float, float, float], count: int
+) -> None:
+    """Cameras lie side by side: along x of optical frames, along y of bodies."""
+    r = Ros(2)
+    rows = still(r, ("/rgb/image", frames[0]), ("/depth/image", frames[1]))
+    bag = r.write(tmp_path / "bag", [tied(r, *frames, offset), *rows], "sqlite3")
+    registry.convert("ros", bag, tmp_path / "rec")
+    warnings = described(tmp_path / "rec")["warnings"]
+    assert sum("taken as optical frames (z forward)" in text for text in warnings) == count
+    with LogFile(tmp_path / "rec" / "alpha.mcap") as log:
+        assert "/alpha/camera/depth" in log.channels
