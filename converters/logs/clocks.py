@@ -2,7 +2,8 @@
 
 - One recorder wrote the messages of several robots: its times are common to all. Headers of a robot lie before them by
   the time that messages take, at least; the least of it is taken to be the same for every robot.
-- Each robot has its own recorder, and some messages stand in both logs: their times of recording differ by the clocks'
+- Each robot has its own recorder, and some messages stand in both logs, known by what they say and by the time in their
+  header (what has no time, such as a counter, may be said twice): their times of recording differ by the clocks'
   difference and by the transmission from one robot to the other. Messages in both directions bound the difference from
   both sides; from one direction the time of transmission cannot be separated.
 - Otherwise nothing can be said: robots that do not see each other move independently.
@@ -22,13 +23,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.logs.entries import NANOSECONDS
-from duagc.converters.logs.files import Log
+from duagc.converters.logs.choice import IMAGE_TYPES, INFO_TYPE, POINTS_TYPE
+from duagc.converters.logs.entries import NANOSECONDS, stamp_ns
+from duagc.converters.logs.files import Log, is_below
+from duagc.converters.logs.frames import TF_TYPES
+from duagc.converters.logs.motion import IMU_TYPE
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import so3
 
 MOST_SHARED = 5000  # messages of a log that are compared
 LEAST_SHARED = 5
+CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+UNSHARED = (*IMAGE_TYPES, INFO_TYPE, POINTS_TYPE, IMU_TYPE, *TF_TYPES)  # large, or of every robot alike
+Times = dict[tuple[str, bytes], int]
 LEAST_OFFSET_S = 0.02  # what pairing of images bears, and what transport takes
 RATE_HZ = 100.0  # of angular speeds that are compared
 LEAST_CORRELATION = 0.8
@@ -152,8 +160,9 @@ def compare(clocks: Sequence[RobotClock]) -> dict[str, Offset]:
     """Offset of every robot's times to those of the first."""
     reference = clocks[0]
     out = {reference.robot: Offset(0.0, 0.0, 0.0, "the reference")}
+    known: dict[tuple[str, ...], Times] = {}
     for clock in clocks[1:]:
-        out[clock.robot] = _offset(reference, clock)
+        out[clock.robot] = _offset(reference, clock, known)
     return out
 
 
@@ -168,8 +177,8 @@ def overlap_warnings(clocks: Sequence[RobotClock]) -> list[str]:
     ]
 
 
-def _offset(a: RobotClock, b: RobotClock) -> Offset:
-    recorded = _recorder_offset(a, b)
+def _offset(a: RobotClock, b: RobotClock, known: dict[tuple[str, ...], Times]) -> Offset:
+    recorded = _recorder_offset(a, b, known)
     if recorded.seconds is None or not (a.header and b.header):
         return recorded
     # header + delay is the recorder's time; the least delays are taken to be equal, up to their usual size
@@ -185,13 +194,15 @@ def _offset(a: RobotClock, b: RobotClock) -> Offset:
     )
 
 
-def _recorder_offset(a: RobotClock, b: RobotClock) -> Offset:
-    """What to add to times of b's recorder to have those of a's."""
+def _recorder_offset(a: RobotClock, b: RobotClock, known: dict[tuple[str, ...], Times]) -> Offset:
+    """What to add to times of b's recorder to have those of a's. known: of a, by topics; what is read is added."""
     if a.files & b.files:
         return Offset(0.0, 0.0, 0.0, "one recorder")
     shared = sorted(set(a.log.topics) & set(b.log.topics))
-    shared = [t for t in shared if a.log.topics[t].count and b.log.topics[t].count]
-    times_a, times_b = _times(a.log, shared), _times(b.log, shared)
+    shared = [t for t in shared if all(_tells_time(log, t) for log in (a.log, b.log))]
+    times_a, times_b = known.get(tuple(shared)), _times(b.log, shared)
+    if times_a is None:
+        times_a = known[tuple(shared)] = _times(a.log, shared)
     rows = [(key[0], times_a[key] - times_b[key]) for key in times_a if key in times_b]
     if len(rows) < LEAST_SHARED:
         return Offset(None, None, None, "recorders of their own, and no messages that both recorded")
@@ -220,18 +231,31 @@ def _recorder_offset(a: RobotClock, b: RobotClock) -> Offset:
 def _sender(topic: str, a: RobotClock, b: RobotClock) -> int:
     """1 or 2: the robot whose namespace a topic is in; 0: neither."""
     for number, clock in ((1, a), (2, b)):
-        if clock.namespace and topic.startswith(f"{clock.namespace}/"):
+        if clock.namespace and is_below(topic, clock.namespace):
             return number
     return 0
 
 
-def _times(log: Log, topics: Sequence[str]) -> dict[tuple[str, bytes], int]:
+def _tells_time(log: Log, topic: str) -> bool:
+    """Whether the messages of a topic may be known again in another log: they hold a time, and are small."""
+    known = log.topics[topic]
+    if known.type in UNSHARED or not known.count:
+        return False
+    try:
+        return known.type == CLOCK_TYPE or hasattr(log.first(topic), "header")
+    except DuagError:  # of a type that is not understood
+        return False
+
+
+def _times(log: Log, topics: Sequence[str]) -> Times:
     """When the messages of some topics were recorded, by topic and content; what comes twice is left out."""
-    found: dict[tuple[str, bytes], int] = {}
+    found: Times = {}
     twice: set[tuple[str, bytes]] = set()
     for number, entry in enumerate(log.entries(*topics) if topics else ()):
         if number >= MOST_SHARED:
             break
+        if log.topics[entry.topic].type != CLOCK_TYPE and not stamp_ns(entry.read()):
+            continue
         key = entry.topic, hashlib.blake2b(entry.data, digest_size=16).digest()
         if key in found:
             twice.add(key)

@@ -22,7 +22,7 @@ from duagc.pipeline.geometry import so3
 from duagc.pipeline.recording import format_info, info, open_rgbd, read_log
 from tests.fixtures.box_room import path
 from tests.fixtures.kimera_multi import imu
-from tests.fixtures.ros_bags import FRAMES, START_NS, STEP_NS, Ros, scene
+from tests.fixtures.ros_bags import FRAMES, START_NS, STEP_NS, Ros, scene, still
 from tests.fixtures.ros_clocks import HUSKY_LATE_NS, both, moved_headers
 
 
@@ -98,7 +98,9 @@ def chat(r: Ros, sender: str, at_own: bool, seed: int) -> list[tuple[str, int, A
         sent = START_NS + k * 10_000_000
         way = 0 if at_own else int(rng.integers(4_000_000, 15_000_000))
         ahead = RECORDER_NS if (sender == "husky") == at_own else 0
-        message = r.make("std_msgs/msg/String", data=f"{sender} {k}")
+        own = sent + (RECORDER_NS if sender == "husky" else 0)
+        place = r.make("geometry_msgs/msg/Point", x=float(k), y=0.0, z=0.0)
+        message = r.make("geometry_msgs/msg/PointStamped", header=r.header(own, sender), point=place)
         rows.append((f"/{sender}/chat", sent + way + ahead, message))
     return rows
 
@@ -122,6 +124,41 @@ def two_logs(tmp_path: Path, speakers: tuple[str, ...], namespaces: bool) -> Pat
             lines.append(f'{option} = "/{robot}/camera/{topic}"\n')
     (tmp_path / "team.toml").write_text("".join(lines))
     return tmp_path / "team.toml"
+
+
+def test_messages_without_a_time_tell_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counters of two robots say the same at times that have nothing to do with each other; images are not read."""
+    r = Ros(2)
+    for robot, late_ns in (("husky", 0), ("jackal", 37_000_000_000)):
+        rows = [(t, ns + late_ns, m) for t, ns, m in moved_headers(r, still(r), late_ns)]
+        rows += [
+            ("/heartbeat", START_NS + late_ns + k * STEP_NS, r.make("std_msgs/msg/UInt32", data=k))
+            for k in range(20)
+        ]
+        r.write(tmp_path / "logs" / robot, sorted(rows, key=lambda x: x[1]), "mcap")
+    hashed: list[bytes] = []
+    digest = clocks.hashlib.blake2b
+    monkeypatch.setattr(
+        clocks.hashlib, "blake2b", lambda data, **more: hashed.append(data) or digest(data, **more)
+    )
+    registry.convert("ros", tmp_path / "logs", tmp_path / "rec", options=["clocks=estimated"])
+    assert clocks_of(tmp_path / "rec")["bravo"]["offset_s"] is None
+    assert start(tmp_path / "rec", "bravo") - start(tmp_path / "rec", "alpha") == 37_000_000_000
+    assert not hashed
+
+
+def test_the_reference_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    r = Ros(2)
+    for robot in ("a", "b", "c"):
+        r.write(
+            tmp_path / "logs" / robot, sorted(still(r) + chat(r, "x", False, 1), key=lambda x: x[1]), "mcap"
+        )
+    read: list[str] = []
+    times = clocks._times
+    monkeypatch.setattr(clocks, "_times", lambda log, topics: read.append(log.name) or times(log, topics))
+    registry.convert("ros", tmp_path / "logs", tmp_path / "rec")
+    assert sorted(Path(name).name for name in read) == ["a", "b", "c"]
+    assert clocks_of(tmp_path / "rec")["charlie"]["offset_s"] == 0
 
 
 def test_messages_in_both_directions_bound_the_difference(tmp_path: Path) -> None:
