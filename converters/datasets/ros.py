@@ -30,7 +30,7 @@ from duagc.converters.logs.derived import Picture, Sweeps
 from duagc.converters.logs.describe import namespaces
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
-from duagc.converters.logs.sources import Source, sources_of
+from duagc.converters.logs.sources import Source, check_out, pieces_words, sources_of, unread
 from duagc.converters.logs.unmeasured import farthest_measured_m
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter
@@ -63,6 +63,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
     """
     determinism.configure_opencv()
     sources = sources_of(src, options)
+    check_out(out, sources)
     if robots and robots != len(sources):
         raise DuagError(f"{src}: found {len(sources)} robots, expected --robots {len(sources)}")
     said = {s.robot: s.settings.model_dump() for s in sources}
@@ -74,10 +75,14 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         RecordingWriter(out, "", source, "ros", parameters=parameters, force=force) as recording,
         ExitStack() as opened,
     ):
+        recording.warnings += unread(src)
         robot_logs = {}
         for part in sources:
             log = opened.enter_context(open_log(part.paths, part.name))
             robot_logs[part.robot] = _robot_log(log, part)
+        spans = {robot: (min(found.pairs), max(found.pairs)) for robot, found in robot_logs.items()}
+        if src.suffix != ".toml" and (words := pieces_words(sources, spans)):
+            raise DuagError(f"{src}: {words}")
         settle_clocks(recording, robot_logs)
         for part in sources:
             write_robot(recording, part.robot, robot_logs[part.robot], part.label)

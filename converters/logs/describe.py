@@ -13,17 +13,16 @@ from typing import Any
 import numpy as np
 
 from duagc.converters.logs.choice import POINTS_TYPE, Chooser
-from duagc.converters.logs.clocks import compare, overlap_warnings
+from duagc.converters.logs.clocks import RobotClock, compare, overlap_warnings
 from duagc.converters.logs.entries import NANOSECONDS, Entry
-from duagc.converters.logs.files import SUFFIXES, Log, open_log
+from duagc.converters.logs.files import SUFFIXES, Log, is_own_log, open_log
 from duagc.converters.logs.motion import IMU_TYPE, POSE_TYPES
 from duagc.converters.logs.robot_log import RobotLog
-from duagc.converters.logs.sources import Source, is_log, robot_of, sources_of
+from duagc.converters.logs.sources import Source, is_log, pieces_words, robot_of, sources_of, unread
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
-from duagc.pipeline.recording.names import LOG_RECORD, MAGIC, RECORDING_FILE
+from duagc.pipeline.recording.names import MAGIC, RECORDING_FILE
 
-HEAD_BYTES = 1024
 HEADERS_FIRST, HEADERS_EACH = (
     100,
     20,
@@ -35,9 +34,8 @@ def is_foreign(path: Path) -> bool:
     if path.suffix == ".toml":
         return path.is_file()
     if path.suffix == ".mcap" and path.is_file():
-        with path.open("rb") as stream:  # our writer's first record says what the log is
-            head = stream.read(HEAD_BYTES)
-        return head.startswith(MAGIC) and LOG_RECORD.encode() not in head
+        with path.open("rb") as stream:
+            return stream.read(len(MAGIC)) == MAGIC and not is_own_log(path)
     if path.is_file():
         return path.suffix in SUFFIXES
     if not path.is_dir() or (path / RECORDING_FILE).is_file():
@@ -58,7 +56,8 @@ def describe(src: Path) -> dict[str, Any]:
     logs: dict[str, Any] = {}
     robots: dict[str, Any] = {}
     sources = list(_robots(src))
-    clocks = []
+    clocks: list[RobotClock] = []
+    pieces: list[str] = []
     with ExitStack() as opened:
         for source, spaces in sources:
             log = opened.enter_context(open_log(source.paths, source.name))
@@ -72,6 +71,9 @@ def describe(src: Path) -> dict[str, Any]:
                     robots[source.robot]["drift_ppm"] = 1e6 * robot_log.drift.rate
                 robot_log.settle_drift()
                 clocks.append(robot_log.clock(source.robot))
+        spans = {c.robot: (c.start_ns, c.end_ns) for c in clocks}
+        if src.suffix != ".toml" and (words := pieces_words([s for s, _ in sources], spans)):
+            pieces.append(words)
         if len(clocks) > 1:
             for robot, offset in compare(clocks).items():
                 robots[robot]["clock"] = offset.row()
@@ -79,7 +81,7 @@ def describe(src: Path) -> dict[str, Any]:
         "kind": "foreign",
         "logs": logs,
         "robots": robots,
-        "warnings": overlap_warnings(clocks) if clocks else [],
+        "warnings": unread(src) + pieces + (overlap_warnings(clocks) if clocks else []),
     }
 
 

@@ -20,8 +20,10 @@ from typing import Any, Protocol
 
 from duagc.converters.logs.entries import Entry, LogTopic
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording.names import LOG_RECORD, MAGIC
 
 SUFFIXES = (".bag", ".db3", ".mcap")
+HEAD_BYTES = 1024
 
 
 class LogPart(Protocol):
@@ -84,6 +86,19 @@ class Log:
         if entry is None:
             raise DuagError(f"{self.name}: {topic} has no message, expected one")
         return entry.read()
+
+
+def is_own_log(path: Path) -> bool:
+    """Whether a file is a log that DUAG-C wrote, by its first record.
+
+    Args:
+        path: of any file.
+    """
+    if path.suffix != ".mcap" or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        head = stream.read(HEAD_BYTES)
+    return head.startswith(MAGIC) and LOG_RECORD.encode() in head
 
 
 def is_below(topic: str, namespace: str) -> bool:

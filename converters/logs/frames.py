@@ -169,7 +169,8 @@ def body_axes_of_camera(color_frame: str, frame: str, T: Array, option: str) -> 
         T: [4, 4], ties them, by the log's transforms.
         option: states the same.
     """
-    if any("optical" in name.lower() for name in (color_frame, frame)) or T[2, 2] < UPRIGHT:
+    named = any("optical" in name.lower() for name in (color_frame, frame))
+    if named or frame_name(color_frame) == frame_name(frame) or T[2, 2] < UPRIGHT:
         return []
     return [
         f"{color_frame!r} is taken as an optical frame (z forward), but its z axis is that of {frame!r}: "

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Message, Schema
+from mcap.reader import SeekingReader, Summary
+from mcap.records import Channel, Chunk, Message, Schema, Statistics
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from duagc import schemas
@@ -63,6 +63,7 @@ class McapFile:
             and statistics
             and summary.chunk_indexes
             and all(chunk.message_index_offsets for chunk in summary.chunk_indexes)
+            and _is_complete(summary, statistics)
         )
         if summary and statistics and self._indexed:
             self._chunks = Chunks(self._stream, summary.chunk_indexes)
@@ -180,6 +181,19 @@ class McapFile:
 
     def close(self) -> None:
         self._stream.close()
+
+
+def _is_complete(summary: Summary, statistics: Statistics) -> bool:
+    """Whether a summary repeats all channels that have messages, and their schemas; writers may leave them out."""
+    known = summary.channels
+    return (
+        all(
+            number in known and (known[number].schema_id == 0 or known[number].schema_id in summary.schemas)
+            for number, count in statistics.channel_message_counts.items()
+            if count
+        )
+        and sum(statistics.channel_message_counts.values()) == statistics.message_count
+    )
 
 
 class _Decoder(Protocol):

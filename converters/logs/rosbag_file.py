@@ -13,7 +13,7 @@ from duagc.converters.logs import foxglove
 from duagc.converters.logs.bag_messages import messages
 from duagc.converters.logs.entries import NANOSECONDS, Entry, LogTopic, sound_time, stamp_ns
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import check_file
+from duagc.pipeline.base.files import check_file, read_text
 
 _READ = {
     "builtin_interfaces": "Time",
@@ -32,18 +32,15 @@ class RosBag:
     """A bag, read by rosbags. Bags of ROS 2 without types are read with those of Humble."""
 
     def __init__(self, path: Path) -> None:
-        from rosbags.highlevel import AnyReader
         from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.typesys import Stores, get_typestore
 
         self.path = path
         hint = "; `rosbag reindex` mends one that was cut short" if path.suffix == ".bag" else ""
         wanted = f"a bag of ROS 1 or ROS 2{hint}"
-        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        for file in _files_of(path) if path.is_dir() else [path]:
             check_file(file, wanted)
         with reading(path, wanted):
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            self._reader.open()
+            self._reader = _opened(path)
             check_definitions(self._reader.typestore.fielddefs)
             for reader in self._reader.readers:
                 if isinstance(reader, Reader1):
@@ -92,6 +89,55 @@ class RosBag:
     def close(self) -> None:
         with reading(self.path, "a sound bag of ROS 1 or ROS 2"):  # a database may notice its damage only now
             self._reader.close()
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """What of a folder of `ros2 bag` belongs to it: files that its metadata names."""
+    metadata = folder / "metadata.yaml"
+    lines = read_text(metadata, "the metadata of a bag of ROS 2").splitlines()
+    named = {
+        line.split(": ")[-1].strip().removeprefix("- ").strip("'\"").rpartition("/")[-1] for line in lines
+    }
+    return [metadata, *(file for file in sorted(folder.iterdir()) if file.name in named)]
+
+
+def _opened(path: Path) -> Any:
+    """`AnyReader` of a bag; definitions of types that are not read here may be broken."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    try:
+        reader.open()
+    except Exception:  # of a bag that is broken itself it comes again
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader._open = partial(_open_sound_types, reader)
+        reader.open()
+    return reader
+
+
+def _open_sound_types(reader: Any) -> None:
+    """What `AnyReader` does to open a bag, without the types that cannot be understood and are not read."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    for inner in reader.readers:
+        reader.stack.enter_context(inner)
+    connections = [c for inner in reader.readers for c in inner.connections]
+    store = get_typestore(Stores.EMPTY)
+    for c in sorted(connections, key=lambda c: c.msgtype not in READ_TYPES):
+        try:
+            if c.msgdef.format.name != "MSG":
+                raise ValueError(f"{c.msgtype} is defined in {c.msgdef.format.name}")
+            found, alone = get_types_from_msg(c.msgdef.data, c.msgtype), get_typestore(Stores.EMPTY)
+            alone.register(found)
+            own = alone.hash_rihs01(c.msgtype) if reader.is2 else alone.generate_msgdef(c.msgtype)[1]
+            if c.digest and c.digest != own:
+                raise ValueError(f"{c.msgtype} has digest {c.digest}, expected {own}")
+            store.register(found)
+        except Exception:
+            if c.msgtype in READ_TYPES:
+                raise
+    reader.connections, reader.typestore = connections, store
 
 
 def _bound_chunks(reader: Any) -> None:

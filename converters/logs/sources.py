@@ -18,15 +18,26 @@ from pathlib import Path
 from typing import Any
 
 from duagc.converters.layouts.image_files import options_of
-from duagc.converters.logs.files import SUFFIXES
+from duagc.converters.logs.entries import NANOSECONDS
+from duagc.converters.logs.files import SUFFIXES, is_own_log
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.writer import robot_names
+from duagc.pipeline.base.atomic_folder import RECORDING, RUN
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import check_file, read_text
 from duagc.schemas import topics
 
 NAMESPACE = "{namespace}"  # stands for that of each robot in the names of topics
 TOPICS = ("color", "depth", "color_info", "depth_info", "imu", "odometry", "truth", "truth_file")
+PIECES_NS = 5 * NANOSECONDS  # between the pieces of one log
+REMEDIES = {  # by how names of files end that hold a log: why it is not read
+    ".bag.active": "was not closed (`rosbag reindex` mends it, then name it .bag)",
+    ".db3.zstd": "is compressed (`zstd -d` unpacks it)",
+    ".mcap.zstd": "is compressed (`zstd -d` unpacks it)",
+    ".bag.part": "was not downloaded to its end",
+    ".db3.part": "was not downloaded to its end",
+    ".mcap.part": "was not downloaded to its end",
+}
 GROUPING = ("namespaces", "pieces")  # options that say which logs are whose, which a TOML file does itself
 
 
@@ -170,25 +181,95 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
     if not src.exists():
         raise DuagError(f"{src}: no such file or folder, expected a log")
     if src.is_file() and src.suffix not in SUFFIXES:
-        raise DuagError(f"{src}: is no log, expected one of {', '.join(SUFFIXES)}")
+        why = _remedy(src) or "is no log"
+        raise DuagError(f"{src}: {why}, expected one of {', '.join(SUFFIXES)}")
     if not src.is_dir():
         check_file(src, "a log")
     if is_log(src):
         return {src.name: (src,)}
     groups = {}
     for path in sorted(src.iterdir(), key=_natural):
-        inner = (path,) if is_log(path) else _inside(path)
+        inner = (path,) if is_log(path) and not is_own_log(path) else _inside(path)
         if inner:
             groups[path.name] = inner
     if not groups:
-        raise DuagError(f"{src}: found no log, expected one for each robot")
+        more = "".join(f"; {text}" for text in unread(src))
+        raise DuagError(f"{src}: found no log, expected one for each robot{more}")
     return groups
 
 
 def _inside(folder: Path) -> tuple[Path, ...]:
-    if not folder.is_dir() or folder.name.startswith("."):
+    """The logs of a folder; none of a recording or a run of ours."""
+    if not folder.is_dir() or folder.name.startswith(".") or _is_own_folder(folder):
         return ()
-    return tuple(path for path in sorted(folder.iterdir(), key=_natural) if is_log(path))
+    paths = sorted(folder.iterdir(), key=_natural)
+    return tuple(path for path in paths if is_log(path) and not is_own_log(path))
+
+
+def _is_own_folder(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in (*RECORDING[1], *RUN[1]))
+
+
+def unread(src: Path) -> list[str]:
+    """What to say of files of a folder that hold a log, but not in a form that is read.
+
+    Args:
+        src: a folder of logs, or anything else.
+    """
+    if not src.is_dir() or is_log(src):
+        return []
+    paths = [p for p in sorted(src.iterdir()) if not p.name.startswith(".")]
+    folders = [p for p in paths if p.is_dir() and not is_log(p) and not _is_own_folder(p)]
+    paths += [p for folder in folders for p in sorted(folder.iterdir())]
+    return [f"{path.name} {words}; left out" for path in paths if path.is_file() and (words := _remedy(path))]
+
+
+def _remedy(path: Path) -> str:
+    """Why a file that holds a log is not read as it is; empty: it holds none, or is read."""
+    return next((words for end, words in REMEDIES.items() if path.name.endswith(end)), "")
+
+
+def check_out(out: Path, sources: Sequence[Source]) -> None:
+    """Refuse to write over what is read.
+
+    Args:
+        out: folder of the recording.
+        sources: of all robots.
+    Raises:
+        DuagError: a log is the folder, or lies in it.
+    """
+    place = out.resolve()
+    for path in (path for source in sources for path in source.paths):
+        if place == path.resolve() or place in path.resolve().parents:
+            raise DuagError(
+                f"{out}: holds {path.name}, which is to be read; expected another folder for --out"
+            )
+
+
+def pieces_words(sources: Sequence[Source], spans_ns: Mapping[str, tuple[int, int]]) -> str:
+    """What to say of logs that are pieces of one, by their names and times; empty: they are not.
+
+    Args:
+        sources: of all robots.
+        spans_ns: first and last time of the images, by robot, of those that are known.
+    """
+    numbered = {}
+    for source in sources:
+        match = re.fullmatch(r"(.+)_(\d+)", source.paths[0].stem)
+        if match and len(source.paths) == 1 and source.robot in spans_ns and not source.namespace:
+            numbered[match[1], int(match[2])] = source
+    for (stem, number), source in numbered.items():
+        after = numbered.get((stem, number + 1))
+        if after is None:
+            continue
+        between_ns = spans_ns[after.robot][0] - spans_ns[source.robot][1]
+        if 0 < between_ns < PIECES_NS:
+            return (
+                f"{after.paths[0].name} begins {between_ns / NANOSECONDS:.3f} s after the end of "
+                f"{source.paths[0].name}, as pieces of one log do; expected --set pieces=true, or a TOML file "
+                "that says which robots they are"
+            )
+    return ""
 
 
 def is_log(path: Path) -> bool:
