@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.ros_images import (
+    UnusableImage,
+    check_decodes,
     color_bytes,
     depth_values,
     encoded_size,
     in_meters,
-    is_cut_short,
 )
 from duagc.converters.layouts.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from duagc.converters.logs import Log, open_log
@@ -160,24 +161,26 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         robot.set_lidar(derived.lidar.T_camera_lidar, derived.lidar.range_sigma_m)
     check = ReprojectionCheck(source.camera, len(pairs), gap)
     farthest_m = _farthest_m(source)
-    without = empty = far = cut = 0
+    without = empty = far = lost = 0
+    cut: list[UnusableImage] = []
     written: set[int] = set()
 
-    def pictured(frame: tuple[int, Any, Any]) -> tuple[int, Picture | None, int]:
+    def pictured(frame: tuple[int, Any, Any]) -> tuple[int, Picture | UnusableImage, int]:
         stamp_ns, color, depth = frame
-        if is_cut_short(color) or is_cut_short(depth):
-            return stamp_ns, None, 0
-        if derived:
-            partner_ns = pairs[stamp_ns]
-            assert partner_ns is not None  # or there would be nothing to derive depth from
-            return stamp_ns, derived.picture(color, depth, stamp_ns, partner_ns), 0
-        return stamp_ns, *_measured(source, stamp_ns, color, depth, farthest_m=farthest_m)
+        try:
+            if derived:
+                partner_ns = pairs[stamp_ns]
+                assert partner_ns is not None  # or there would be nothing to derive depth from
+                return stamp_ns, derived.picture(color, depth, stamp_ns, partner_ns), 0
+            return stamp_ns, *_measured(source, stamp_ns, color, depth, farthest_m=farthest_m)
+        except UnusableImage as error:
+            return stamp_ns, error, 0
 
     # what is derived may depend on the frames before
     found = in_order(pictured, source.frames(), threads=1 if derived else None)
     for index, (stamp_ns, picture, beyond) in enumerate(track(found, f"convert {robot.name}", len(pairs))):
-        if picture is None:
-            cut += 1
+        if isinstance(picture, UnusableImage):
+            cut.append(picture)
             continue
         far += beyond
         T = source.true_pose(stamp_ns)
@@ -187,6 +190,8 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         if picture.points_lidar is not None:
             robot.add_points(at_ns, picture.points_lidar)
         depth_ns = source.depth_stamp_ns(stamp_ns)
+        if not derived and picture.depth is None and pairs[stamp_ns] is not None:
+            lost, depth_ns = lost + 1, None
         robot.add_frame(
             at_ns,
             *encoded,
@@ -201,8 +206,16 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
             at_depth = None if depth_ns is None else source.true_pose(pairs[stamp_ns])
             check.add(index, source.depth_m(picture), T if at_depth is None else at_depth)
         empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))
+    if len(cut) == len(pairs):
+        raise cut[0]
     if cut:
-        source.warnings.append(f"{cut} frames have color or depth that is cut short; left out")
+        source.warnings.append(f"{len(cut)} frames have color or depth that is cut short or broken; left out")
+    if lost and lost + len(cut) >= sum(depth_ns is not None for depth_ns in pairs.values()):
+        raise DuagError(
+            f"{log}: {source.depth}: {lost} images are cut short or broken, expected depth in some"
+        )
+    if lost:
+        source.warnings.append(f"{lost} frames have depth that is cut short or broken; their color is kept")
     if far:
         limit = FARTHEST * source.depth_scale
         source.warnings.append(
@@ -212,7 +225,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     if source.truth is not None and without:
         source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
     if not isinstance(derived, Sweeps):
-        with_depth = sum(depth_ns is not None for depth_ns in pairs.values()) - cut
+        with_depth = sum(depth_ns is not None for depth_ns in pairs.values()) - len(cut) - lost
         rows["without_depth"] = empty / max(1, with_depth * source.camera.width * source.camera.height)
     drift = {} if source.drift is None else {"clock_drift_ppm": 1e6 * source.drift.rate}
     return {**rows, **check.result(log, max_ratio), **_truth_lag(source), **drift}
@@ -247,16 +260,23 @@ def _measured(
     where = f"{log}: {source.color} at {stamp_ns} ns"
     data, color_format = color_bytes(color, where)
     _check_size(where, encoded_size(data) or (0, 0), source.camera)
+    if maps is None and hasattr(color, "format"):
+        check_decodes(data, where)
     if maps is not None:
         image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
-            raise DuagError(f"{where}: no decoder reads it, expected a color image")
+            raise UnusableImage(f"{where}: no decoder reads it, expected a color image")
         data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
         color_format = "png"
     if depth is None:
         return Picture(data, color_format), 0
     where = f"{log}: {source.depth} at {stamp_ns} ns"
-    values: NDArray[Any] = depth_values(depth, where)
+    try:
+        values: NDArray[Any] = depth_values(depth, where)
+    except UnusableImage:
+        if source.settings.association != "all":
+            raise
+        return Picture(data, color_format), 0
     _check_size(where, (values.shape[1], values.shape[0]), source.depth_camera.camera)
     if farthest_m:
         meters = in_meters(values, source.settings.depth_scale)

@@ -1,9 +1,8 @@
-"""Images and cameras as ROS messages hold them: color to encoded bytes, depth to meters, CameraInfo to a pinhole."""
+"""Images as ROS messages hold them: color to encoded bytes, depth to meters."""
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
-from duagc.pipeline.geometry.camera import PinholeCamera
 
 Depth = NDArray[np.float32]
 PNG_LEVEL = 1
@@ -33,23 +31,11 @@ _COLOR_CODES = {  # encoding: channels, and the name of OpenCV's conversion to B
     "yuv422_yuy2": (2, "COLOR_YUV2BGR_YUY2"),
     "yuyv": (2, "COLOR_YUV2BGR_YUY2"),
 }
-LONGEST_LENS = 200  # focal length over the longer side of the image, and the inverse
-FISHEYE = (
-    "equidistant",
-    "fisheye",
-    "kannala_brandt",
-)  # one model, by the names that ROS, RealSense, Foxglove give it
-# with no name, as older drivers; RealSense names the model whose numbers are zero or those of plumb_bob
-POLYNOMIAL = (
-    "",
-    "plumb_bob",
-    "rational_polynomial",
-    "radtan",
-    "brown_conrady",
-    "Brown Conrady",
-    "Modified Brown Conrady",
-)
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+
+
+class UnusableImage(DuagError):  # noqa: N818 (the name says it)
+    """An image of a log is empty, cut short or broken; others of its topic may be sound."""
 
 
 def encoded_size(data: bytes) -> tuple[int, int] | None:
@@ -77,6 +63,41 @@ def is_cut_short(message: Any) -> bool:
     if _is_webp(data):
         return len(data) < 8 + int.from_bytes(data[4:8], "little")
     return data.startswith((b"\xff\xd8\xff", b"\x89PNG")) and encoded_size(data) is None
+
+
+def is_unusable(message: Any) -> bool:
+    """Whether an Image or CompressedImage is empty, cut short or broken; one of a kind that is not read is not.
+
+    Args:
+        message: of ROS.
+    """
+    try:
+        if is_depth(message):
+            depth_values(message, "")
+        elif hasattr(message, "format"):
+            check_decodes(color_bytes(message, "")[0], "")
+        elif message.encoding in _COLOR_CODES:
+            rows_of(message, "", "uint8", _COLOR_CODES[message.encoding][0])
+    except UnusableImage:
+        return True
+    except DuagError:
+        return False
+    return False
+
+
+def check_decodes(data: bytes, where: str) -> None:
+    """Read the pixels of an encoded image, in the cheapest way.
+
+    Args:
+        data: of a JPEG or PNG.
+        where: begins the line of an error.
+    Raises:
+        UnusableImage: no decoder reads them.
+    """
+    import cv2
+
+    if decode_image(data, cv2.IMREAD_REDUCED_GRAYSCALE_8) is None:
+        raise UnusableImage(f"{where}: no decoder reads it, expected a color image")
 
 
 def is_depth(message: Any) -> bool:
@@ -116,10 +137,10 @@ def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]
     """Pixels [h, w, channels] of an Image, without the padding of its rows, in native byte order."""
     kind = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
     if not (message.width > 0 and message.height > 0):
-        raise DuagError(f"{where}: is {message.width}x{message.height} pixels, expected an image")
+        raise UnusableImage(f"{where}: is {message.width}x{message.height} pixels, expected an image")
     used = message.width * channels * kind.itemsize
     if message.step < used or len(message.data) < message.step * (message.height - 1) + used:
-        raise DuagError(
+        raise UnusableImage(
             f"{where}: {len(message.data)} bytes with rows of {message.step}, expected {message.height} rows of at "
             f"least {used}"
         )
@@ -134,7 +155,7 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
     import cv2
 
     if hasattr(message, "format"):
-        data = bytes(message.data)
+        data = _whole(message, where)
         pattern = message.format.split(";")[0].strip()
         if pattern.startswith("bayer_") and (colors := _bayer_as_png(data, pattern, where)) is not None:
             return colors, "png"
@@ -144,7 +165,7 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
             return data, "png"
         if _is_webp(data):
             return _webp_as_png(data, where), "png"
-        raise DuagError(
+        raise UnusableImage(
             f"{where}: {len(data)} bytes of format {message.format!r}, expected JPEG, PNG or WebP"
         )
     if message.encoding not in _COLOR_CODES:
@@ -162,6 +183,16 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
     return cv2.imencode(".png", np.ascontiguousarray(pixels), settings)[1].tobytes(), "png"
 
 
+def _whole(message: Any, where: str) -> bytes:
+    """The data of a CompressedImage that has its end."""
+    if is_cut_short(message):
+        pattern = message.format.split(";")[0].strip()
+        raise UnusableImage(
+            f"{where}: {len(message.data)} bytes of {pattern}, expected an image that has its end"
+        )
+    return bytes(message.data)
+
+
 def _is_webp(data: bytes) -> bool:
     return data.startswith(b"RIFF") and data[8:12] == b"WEBP"
 
@@ -176,7 +207,8 @@ def _bayer_as_png(data: bytes, pattern: str, where: str) -> bytes | None:
     if image is None or image.dtype != np.uint8 or pattern not in _COLOR_CODES:
         found = "no image" if image is None else str(image.dtype)
         known = ", ".join(name for name in _COLOR_CODES if name.startswith("bayer_"))
-        raise DuagError(f"{where}: {found} of {pattern}, expected a JPEG or PNG of one of {known}")
+        kind = UnusableImage if image is None else DuagError
+        raise kind(f"{where}: {found} of {pattern}, expected a JPEG or PNG of one of {known}")
     colors = cv2.cvtColor(image, getattr(cv2, str(_COLOR_CODES[pattern][1])))
     return cv2.imencode(".png", colors, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
 
@@ -187,7 +219,7 @@ def _webp_as_png(data: bytes, where: str) -> bytes:
 
     image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise DuagError(f"{where}: {len(data)} bytes of WebP that no decoder reads, expected an image")
+        raise UnusableImage(f"{where}: {len(data)} bytes of WebP that no decoder reads, expected an image")
     return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
 
 
@@ -206,7 +238,7 @@ def in_meters(values: NDArray[np.uint16] | Depth, scale: float) -> Depth:
 def depth_values(message: Any, where: str) -> NDArray[np.uint16] | Depth:
     """Depth [h, w], 0 where there is none: integers as they stand, uint16, or meters, float32."""
     if hasattr(message, "format"):
-        return _compressed_depth(message.format, bytes(message.data), where)
+        return _compressed_depth(message.format, _whole(message, where), where)
     if message.encoding in ("16UC1", "mono16"):
         return rows_of(message, where, "uint16", 1)[..., 0]
     if message.encoding == "32FC1":
@@ -231,7 +263,7 @@ def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] 
         raise DuagError(f"{where}: depth as JPEG, expected 16-bit depth; eight bits of it are lost")
     plain = data.startswith(b"\x89PNG")
     if not plain and len(data) < 12:
-        raise DuagError(f"{where}: {len(data)} bytes, expected compressed depth")
+        raise UnusableImage(f"{where}: {len(data)} bytes, expected compressed depth")
     body = data if plain else data[12:]
     encoding = text.split(";")[0].strip()
     if not body.startswith(b"\x89PNG"):
@@ -239,7 +271,8 @@ def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] 
     else:
         image = decode_image(body, cv2.IMREAD_UNCHANGED)
         if image is None or image.dtype != np.uint16 or image.ndim != 2:
-            raise DuagError(f"{where}: no decoder finds 16-bit depth in it, expected a PNG of 16 bits")
+            kind = UnusableImage if image is None else DuagError
+            raise kind(f"{where}: no decoder finds 16-bit depth in it, expected a PNG of 16 bits")
         values = image.astype(np.uint16)
     if encoding != "32FC1":
         return values
@@ -254,32 +287,32 @@ def _rvl(body: bytes, where: str) -> NDArray[np.uint16]:
     """RVL (Wilson 2017): runs of zeros and of differences in nibbles of three bits; columns and rows in front."""
     broken = f"{where}: broken RVL depth, expected columns, rows and runs"
     if len(body) < 8:
-        raise DuagError(broken)
+        raise UnusableImage(broken)
     columns, rows = struct.unpack("<II", body[:8])
     if not 0 < columns * rows <= 1 << 26:
-        raise DuagError(broken)
+        raise UnusableImage(broken)
     words = np.frombuffer(body[8 : 8 + (len(body) - 8) // 4 * 4], "<u4")
     shifts = np.arange(28, -4, -4, dtype=np.uint32)
     nibbles = ((words[:, None] >> shifts) & 15).ravel().astype(np.int64)  # the highest nibble comes first
     ends = np.flatnonzero(nibbles < 8)
     if not len(ends):
-        raise DuagError(broken)
+        raise UnusableImage(broken)
     starts = np.concatenate([[0], ends[:-1] + 1])
     nibbles = nibbles[: ends[-1] + 1]
     place = np.arange(len(nibbles)) - np.repeat(starts, ends - starts + 1)
     if place.max() > 10:
-        raise DuagError(broken)
+        raise UnusableImage(broken)
     numbers = np.add.reduceat((nibbles & 7) << (3 * place), starts)
     out = np.zeros(columns * rows, np.int64)
     at = position = previous = 0
     while position < len(out):
         if at + 1 >= len(numbers):
-            raise DuagError(broken)
+            raise UnusableImage(broken)
         zeros, count = int(numbers[at]), int(numbers[at + 1])
         at += 2
         position += zeros
         if position + count > len(out) or at + count > len(numbers):
-            raise DuagError(broken)
+            raise UnusableImage(broken)
         coded = numbers[at : at + count]
         steps = (coded >> 1) ^ -(coded & 1)
         values = previous + np.cumsum(steps)
@@ -287,93 +320,5 @@ def _rvl(body: bytes, where: str) -> NDArray[np.uint16]:
         previous = int(values[-1]) if count else previous
         at, position = at + count, position + count
     if out.min(initial=0) < 0 or out.max(initial=0) > 65535:
-        raise DuagError(broken)
+        raise UnusableImage(broken)
     return out.reshape(rows, columns).astype(np.uint16)
-
-
-@dataclass(frozen=True)
-class RosCamera:
-    """A CameraInfo: the pinhole, and the distortion of its images.
-
-    Attributes:
-        fisheye: whether the distortion is that of the equidistant model.
-        is_straight: whether it says that there is no distortion, by numbers that are all zero.
-    """
-
-    camera: PinholeCamera
-    distortion: tuple[float, ...]
-    fisheye: bool
-    frame_id: str
-    is_straight: bool = False
-
-    @staticmethod
-    def of(message: Any, rectified: bool, where: str) -> RosCamera:
-        """From a CameraInfo of ROS 1 or 2. rectified: the images belong to P, without distortion."""
-        K, D, P = (
-            np.array(getattr(message, name if hasattr(message, name) else name.lower()), dtype=np.float64)
-            for name in ("K", "D", "P")
-        )
-        if K.size != 9 or P.size not in (0, 12):
-            raise DuagError(f"{where}: K and P of {K.size} and {P.size} numbers, expected 9 and 12")
-        model = message.distortion_model
-        if rectified and np.any(P):
-            fx, cx, fy, cy = P[0], P[2], P[5], P[6]
-            D = np.zeros(0)
-        else:
-            fx, cx, fy, cy = K[0], K[2], K[4], K[5]
-        side = max(message.width, message.height)
-        if not (
-            np.abs([cx, cy]).max() < LONGEST_LENS * side
-            and all(side / LONGEST_LENS < f < LONGEST_LENS * side for f in (fx, fy))
-        ):
-            raise DuagError(
-                f"{where}: focal length {fx:g}, {fy:g} px and center {cx:g}, {cy:g} px of {message.width}x"
-                f"{message.height}, expected those of a camera"
-            )
-        binning = max(1, message.binning_x), max(1, message.binning_y)
-        roi = message.roi
-        width, height = (roi.width or message.width), (roi.height or message.height)
-        camera = PinholeCamera(
-            int(width) // binning[0],
-            int(height) // binning[1],
-            fx / binning[0],
-            fy / binning[1],
-            (cx - roi.x_offset + 0.5) / binning[0] - 0.5,
-            (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
-        )
-        if not np.any(D):
-            return RosCamera(camera, (), False, message.header.frame_id, len(D) > 0)
-        fisheye = model in FISHEYE
-        lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
-        if not fisheye and model not in POLYNOMIAL:
-            known = ", ".join((*POLYNOMIAL[1:], *FISHEYE))
-            raise DuagError(f"{where}: distortion model {model!r}, expected one of {known}")
-        if len(D) not in lengths or not np.isfinite(D).all():
-            raise DuagError(
-                f"{where}: distortion {D.tolist()} of {model!r}, expected {' or '.join(map(str, lengths))} numbers"
-            )
-        return RosCamera(camera, tuple(D.tolist()), fisheye, message.header.frame_id)
-
-    def maps(
-        self, onto: PinholeCamera | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Where in its images every pixel of a pinhole at the same place lies; None without distortion.
-
-        Args:
-            onto: the pinhole; None: its own.
-        """
-        import cv2
-
-        if not self.distortion:
-            return None
-        c = self.camera
-        K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-        onto = onto or c
-        rays, zero = onto.rays().reshape(-1, 1, 3), np.zeros(3)
-        project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
-        if self.fisheye:
-            pixels, _ = project(rays, zero, zero, K, np.array(self.distortion[:4]))
-        else:
-            pixels, _ = project(rays, zero, zero, K, np.array(self.distortion))
-        u, v = pixels.reshape(onto.height, onto.width, 2).astype(np.float32).transpose(2, 0, 1)
-        return np.ascontiguousarray(u), np.ascontiguousarray(v)

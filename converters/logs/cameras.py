@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from duagc.converters.layouts.ros_images import RosCamera, size_of
+from duagc.converters.layouts.ros_camera import RosCamera
+from duagc.converters.layouts.ros_images import size_of
 from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import pose_matrix

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
-from duagc.converters.layouts.ros_images import is_depth
+from duagc.converters.layouts.ros_images import is_depth, is_unusable
 from duagc.converters.logs.files import Log, is_below
 from duagc.pipeline.base.errors import DuagError, closest
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
+MOST_TRIED = 30  # images of a topic that are read to find one that is sound
 VIDEO = ("CompressedVideo", "FFMPEGPacket")  # how the names of schemas of video end
 LEFT, RIGHT = ("left", "infra1", "cam0"), ("right", "infra2", "cam1")
 REGISTERED = (
@@ -51,7 +53,7 @@ class Choice:
 
 
 class Chooser:
-    """Chooses among the topics of one robot; reads the first message of every topic of images."""
+    """Chooses among the topics of one robot; reads the first sound message of every topic of images."""
 
     def __init__(self, log: Log, namespace: str = "", wanted: Mapping[str, str] | None = None) -> None:
         """Initialize.
@@ -63,7 +65,7 @@ class Chooser:
         """
         self.log, self.namespace, self._wanted = log, namespace.rstrip("/"), dict(wanted or {})
         self.images: dict[str, Any] = {
-            t: log.first(t) for t in log.of_type(*IMAGE_TYPES, below=self.namespace)
+            t: first_usable(log, t) for t in log.of_type(*IMAGE_TYPES, below=self.namespace)
         }
         self.infos = log.of_type(INFO_TYPE, below=self.namespace)
         self.clouds = log.of_type(POINTS_TYPE, below=self.namespace)
@@ -168,6 +170,19 @@ def _has(topic: str, hint: str) -> bool:
     if hint not in REGISTERED:
         return hint in topic.lower()
     return re.search(rf"(?<![a-z0-9]){hint}(?![a-z0-9])", topic.lower()) is not None
+
+
+def first_usable(log: Log, topic: str) -> Any:
+    """The first image of a topic that can be read; the very first if none of some can be.
+
+    Args:
+        log: the log.
+        topic: of images.
+    """
+    for entry in itertools.islice(log.entries(topic), MOST_TRIED):
+        if not is_unusable(message := entry.read()):
+            return message
+    return log.first(topic)
 
 
 def video_words(log: Log, namespace: str) -> str:

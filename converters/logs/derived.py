@@ -18,7 +18,8 @@ from duagc.converters.layouts.derived_depth import (
     png,
     spread,
 )
-from duagc.converters.layouts.ros_images import RosCamera, color_bytes
+from duagc.converters.layouts.ros_camera import RosCamera
+from duagc.converters.layouts.ros_images import color_bytes
 from duagc.converters.layouts.stereo import RawCamera, StereoRig
 from duagc.converters.layouts.validity import of_maps
 from duagc.converters.logs.files import Log

@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from duagc.converters.layouts.ros_images import RosCamera
+from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.logs.cameras import realsense_extrinsics
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import Transforms

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.layouts.ros_images import RosCamera, is_integer_depth, size_of
+from duagc.converters.layouts.ros_camera import RosCamera
+from duagc.converters.layouts.ros_images import is_integer_depth, size_of
 from duagc.converters.layouts.tum_layout import Listed, associate, nearest_s
 from duagc.converters.layouts.validity import of_maps
 from duagc.converters.logs.cameras import (

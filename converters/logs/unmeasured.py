@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.layouts.ros_images import depth_values, in_meters, is_cut_short
+from duagc.converters.layouts.ros_images import UnusableImage, depth_values, in_meters
 from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
 from duagc.pipeline.recording.greatest_depth import unmeasured
@@ -33,6 +34,6 @@ def farthest_measured_m(
             break
         if number >= due and is_mapped(entry):
             due += EVERY
-            if not is_cut_short(message := entry.read()):
-                images.append(in_meters(depth_values(message, f"{log.name}: {topic}"), scale))
+            with suppress(UnusableImage):
+                images.append(in_meters(depth_values(entry.read(), f"{log.name}: {topic}"), scale))
     return unmeasured(images)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from duagc.converters import registry
-from duagc.converters.layouts.ros_images import RosCamera
+from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
 from duagc.converters.logs.derived import stereo_of
 from duagc.converters.logs.options import LogOptions

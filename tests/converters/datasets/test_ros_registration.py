@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from duagc.converters import registry
-from duagc.converters.layouts.ros_images import RosCamera
+from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.logs.choice import Chooser
 from duagc.converters.logs.files import open_log
 from duagc.converters.logs.registration import is_named_registered

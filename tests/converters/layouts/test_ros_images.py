@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from duagc.converters.layouts import ros_images
+from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.logs.foxglove import Fields
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -37,9 +38,9 @@ def test_lenses_that_are_not_known_are_refused(model: str, D: list[float], messa
     object.__setattr__(info, "distortion_model", model)
     object.__setattr__(info, "d", np.array(D))
     with pytest.raises(DuagError, match=message):
-        ros_images.RosCamera.of(info, False, "here")
+        RosCamera.of(info, False, "here")
     object.__setattr__(info, "d", np.zeros(0))
-    assert ros_images.RosCamera.of(info, False, "here").maps() is None
+    assert RosCamera.of(info, False, "here").maps() is None
 
 
 def test_one_fisheye_model_has_three_names() -> None:
@@ -48,7 +49,7 @@ def test_one_fisheye_model_has_three_names() -> None:
         info = Ros(2).info(1, "c", COLOR)
         object.__setattr__(info, "distortion_model", model)
         object.__setattr__(info, "d", np.array([0.05, -0.01, 0.002, 0.0]))
-        maps.append(ros_images.RosCamera.of(info, False, "here").maps())
+        maps.append(RosCamera.of(info, False, "here").maps())
     assert all(np.array_equal(maps[0], other) for other in maps[1:])
 
 
@@ -190,7 +191,7 @@ def test_cameras_that_cannot_be_are_refused(K: list[float], message: str) -> Non
     info = Ros(2).info(1, "c", COLOR)
     object.__setattr__(info, "k", np.array(K))
     with pytest.raises(DuagError, match=message):
-        ros_images.RosCamera.of(info, False, "here")
+        RosCamera.of(info, False, "here")
 
 
 def test_the_orientation_in_a_jpeg_turns_no_image() -> None:
@@ -244,9 +245,7 @@ def test_two_pixels_that_share_a_color_are_an_even_number() -> None:
 
 def test_color_is_drawn_as_another_camera_at_its_place_sees_it() -> None:
     """Registered depth may belong to the rectified camera, whose focal length is another."""
-    lens = ros_images.RosCamera.of(
-        Ros(2).info(0, "camera", COLOR, (-0.2, 0.03, 0.001, 0.0, 0.0)), False, "here"
-    )
+    lens = RosCamera.of(Ros(2).info(0, "camera", COLOR, (-0.2, 0.03, 0.001, 0.0, 0.0)), False, "here")
     onto = PinholeCamera(
         COLOR.width, COLOR.height, 0.8 * COLOR.fx, 0.8 * COLOR.fy, COLOR.cx + 2, COLOR.cy - 1
     )

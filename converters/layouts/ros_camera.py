@@ -1,0 +1,117 @@
+"""CameraInfo as ROS messages hold it: the pinhole, and the distortion of its images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+LONGEST_LENS = 200  # focal length over the longer side of the image, and the inverse
+FISHEYE = (
+    "equidistant",
+    "fisheye",
+    "kannala_brandt",
+)  # one model, by the names that ROS, RealSense, Foxglove give it
+# with no name, as older drivers; RealSense names the model whose numbers are zero or those of plumb_bob
+POLYNOMIAL = (
+    "",
+    "plumb_bob",
+    "rational_polynomial",
+    "radtan",
+    "brown_conrady",
+    "Brown Conrady",
+    "Modified Brown Conrady",
+)
+
+
+@dataclass(frozen=True)
+class RosCamera:
+    """A CameraInfo: the pinhole, and the distortion of its images.
+
+    Attributes:
+        fisheye: whether the distortion is that of the equidistant model.
+        is_straight: whether it says that there is no distortion, by numbers that are all zero.
+    """
+
+    camera: PinholeCamera
+    distortion: tuple[float, ...]
+    fisheye: bool
+    frame_id: str
+    is_straight: bool = False
+
+    @staticmethod
+    def of(message: Any, rectified: bool, where: str) -> RosCamera:
+        """From a CameraInfo of ROS 1 or 2. rectified: the images belong to P, without distortion."""
+        K, D, P = (
+            np.array(getattr(message, name if hasattr(message, name) else name.lower()), dtype=np.float64)
+            for name in ("K", "D", "P")
+        )
+        if K.size != 9 or P.size not in (0, 12):
+            raise DuagError(f"{where}: K and P of {K.size} and {P.size} numbers, expected 9 and 12")
+        model = message.distortion_model
+        if rectified and np.any(P):
+            fx, cx, fy, cy = P[0], P[2], P[5], P[6]
+            D = np.zeros(0)
+        else:
+            fx, cx, fy, cy = K[0], K[2], K[4], K[5]
+        side = max(message.width, message.height)
+        if not (
+            np.abs([cx, cy]).max() < LONGEST_LENS * side
+            and all(side / LONGEST_LENS < f < LONGEST_LENS * side for f in (fx, fy))
+        ):
+            raise DuagError(
+                f"{where}: focal length {fx:g}, {fy:g} px and center {cx:g}, {cy:g} px of {message.width}x"
+                f"{message.height}, expected those of a camera"
+            )
+        binning = max(1, message.binning_x), max(1, message.binning_y)
+        roi = message.roi
+        width, height = (roi.width or message.width), (roi.height or message.height)
+        camera = PinholeCamera(
+            int(width) // binning[0],
+            int(height) // binning[1],
+            fx / binning[0],
+            fy / binning[1],
+            (cx - roi.x_offset + 0.5) / binning[0] - 0.5,
+            (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
+        )
+        if not np.any(D):
+            return RosCamera(camera, (), False, message.header.frame_id, len(D) > 0)
+        fisheye = model in FISHEYE
+        lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
+        if not fisheye and model not in POLYNOMIAL:
+            known = ", ".join((*POLYNOMIAL[1:], *FISHEYE))
+            raise DuagError(f"{where}: distortion model {model!r}, expected one of {known}")
+        if len(D) not in lengths or not np.isfinite(D).all():
+            raise DuagError(
+                f"{where}: distortion {D.tolist()} of {model!r}, expected {' or '.join(map(str, lengths))} numbers"
+            )
+        return RosCamera(camera, tuple(D.tolist()), fisheye, message.header.frame_id)
+
+    def maps(
+        self, onto: PinholeCamera | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in its images every pixel of a pinhole at the same place lies; None without distortion.
+
+        Args:
+            onto: the pinhole; None: its own.
+        """
+        import cv2
+
+        if not self.distortion:
+            return None
+        c = self.camera
+        K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
+        onto = onto or c
+        rays, zero = onto.rays().reshape(-1, 1, 3), np.zeros(3)
+        project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
+        if self.fisheye:
+            pixels, _ = project(rays, zero, zero, K, np.array(self.distortion[:4]))
+        else:
+            pixels, _ = project(rays, zero, zero, K, np.array(self.distortion))
+        u, v = pixels.reshape(onto.height, onto.width, 2).astype(np.float32).transpose(2, 0, 1)
+        return np.ascontiguousarray(u), np.ascontiguousarray(v)
