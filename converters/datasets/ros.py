@@ -84,6 +84,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         spans = {robot: (min(found.pairs), max(found.pairs)) for robot, found in robot_logs.items()}
         if src.suffix != ".toml" and (words := pieces_words(sources, spans)):
             raise DuagError(f"{src}: {words}")
+        recording.warnings += _world_warnings(robot_logs)
         settle_clocks(recording, robot_logs)
         for part in sources:
             write_robot(recording, part.robot, robot_logs[part.robot], part.label)
@@ -100,6 +101,17 @@ def _robot_log(log: Log, part: Source) -> RobotLog:
         raise DuagError(f"{error}, or --set namespaces={','.join(spaces)} if each is a robot") from error
 
 
+def _world_warnings(robot_logs: Mapping[str, RobotLog]) -> list[str]:
+    """What to warn of where true poses of robots are in frames of their own."""
+    worlds = {robot: robot_log.truth_world for robot, robot_log in robot_logs.items()}
+    if len(set(filter(None, worlds.values()))) < 2:
+        return []
+    named = ", ".join(f"{robot} in {world!r}" for robot, world in worlds.items() if world)
+    return [
+        f"true poses are in different frames ({named}); expected one, or maps of the team cannot be judged"
+    ]
+
+
 def settle_clocks(recording: RecordingWriter, robot_logs: Mapping[str, RobotLog]) -> None:
     """Say how the robots' clocks differ, and shift their times as the options ask."""
     for robot_log in robot_logs.values():
@@ -109,7 +121,7 @@ def settle_clocks(recording: RecordingWriter, robot_logs: Mapping[str, RobotLog]
     for robot, robot_log in robot_logs.items():
         kind, offset = robot_log.settings.clocks, offsets[robot]
         if kind == "from_zero":
-            robot_log.shift_ns -= min(robot_log.pairs)
+            robot_log.shift_ns -= robot_log.begin_ns
         elif kind == "estimated" and offset.seconds is not None and offset.matters:
             robot_log.shift_ns += round(offset.seconds * NANOSECONDS)
         elif kind == "estimated" and offset.seconds is None:
@@ -329,6 +341,13 @@ class _Readings:
         self._stamps = np.concatenate([imu, odometry])
         self._order = np.argsort(self._stamps, kind="stable")
         self._imu_count, self._source = len(imu), source
+        for topic, stamps in ((source.settings.imu, imu), (source.settings.odometry, odometry)):
+            if len(stamps) and (stamps.max() < min(source.pairs) or stamps.min() > max(source.pairs)):
+                begin, end = (float(t) / NANOSECONDS for t in (stamps.min(), stamps.max()))
+                source.warnings.append(
+                    f"{topic}: its times ({begin:.3f} to {end:.3f} s) have none in common with the images; expected "
+                    "one clock, or --set time_source=log"
+                )
         self._next = int((self._stamps < -source.shift_ns).sum())
         self._T_color_camera = source.T_color_camera
         if self._imu:

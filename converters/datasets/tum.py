@@ -64,6 +64,10 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     settings = options_of(Options, options, "tum")
     frames, _, warnings = tum_layout.frames_of(src, settings)
     camera, distortion, sensor = _camera(src, settings, frames[0].color)
+    if sensor != KINECT and "depth_scale" not in settings.model_fields_set:
+        warnings.append(
+            f"depth is taken as {DEPTH_SCALE} m per unit, as of a Kinect; expected --set depth_scale=METERS"
+        )
     stated = settings.rolling_shutter == "auto" and sensor == KINECT
     readout = kinect_readout() if stated else {}
     clip = Clip(

@@ -22,7 +22,7 @@ LEAST_BASE_M = 0.001
 
 
 @dataclass(frozen=True)
-class View:
+class ImageTopic:
     """An image topic and its camera.
 
     Attributes:
@@ -36,7 +36,7 @@ class View:
     camera: RosCamera
 
 
-def check_infos(color: View, depth: View, settings: LogOptions, name: str) -> None:
+def check_infos(color: ImageTopic, depth: ImageTopic, settings: LogOptions, name: str) -> None:
     """Refuse the only CameraInfo of a log as that of two cameras.
 
     Args:
@@ -78,7 +78,7 @@ def is_named_registered(topic: str) -> bool:
 
 
 def extrinsics(
-    log: Log, color: View, depth: View, transforms: Transforms, *, settings: LogOptions
+    log: Log, color: ImageTopic, depth: ImageTopic, transforms: Transforms, *, settings: LogOptions
 ) -> Array | None:
     """T_color_depth [4, 4]; None if depth is registered already.
 
@@ -142,7 +142,7 @@ def body_axes_of_cameras(color_frame: str, depth_frame: str, T_color_depth: Arra
     )
 
 
-def _is_registered(color: View, depth: View) -> bool:
+def _is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
     a, b = color.camera, depth.camera
     one_frame = a.frame_id == b.frame_id != "" and not _differ(color.frame, depth.frame)
     if a.camera == b.camera and one_frame:

@@ -31,7 +31,7 @@ from duagc.converters.logs.frames import Transforms, body_axes_of_camera
 from duagc.converters.logs.gather import gathered
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader
 from duagc.converters.logs.options import LogOptions
-from duagc.converters.logs.registration import View, check_infos, extrinsics
+from duagc.converters.logs.registration import ImageTopic, check_infos, extrinsics
 from duagc.converters.logs.stamps import sound_stamps
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
@@ -41,6 +41,7 @@ from duagc.pipeline.recording.pairing import TOLERANCE_NS
 from duagc.pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
 
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
+LONGEST_WAIT_S = 60.0  # between color and depth of one clock
 OUT_SCALE = 0.0005  # meters per unit of depth that was registered or came as floats
 
 
@@ -102,7 +103,7 @@ class RobotLog:
         self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
         self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE
 
-    def _derived(self, chooser: Chooser, color: View) -> Derived:
+    def _derived(self, chooser: Chooser, color: ImageTopic) -> Derived:
         """Depth of a stereo pair or of a LiDAR."""
         s = self.settings
         if s.depth_from == "stereo":
@@ -147,13 +148,17 @@ class RobotLog:
         found = gathered(self.log, groups, self.time_ns)
         return self.derived.check([(g[self.color].read(), g[self.depth].read()) for g in found])
 
-    def _view(self, topic: str, option: str, chooser: Chooser) -> View:
+    def _view(self, topic: str, option: str, chooser: Chooser) -> ImageTopic:
         """An image topic with its camera: as the options state it, else by its CameraInfo."""
         image, where = chooser.images[topic], f"{self.name}: {topic}"
         if text := stated(self.settings, option, bool(chooser.infos)):
-            return View(topic, image.header.frame_id, "", stated_camera(text, image, where))
+            return ImageTopic(topic, image.header.frame_id, "", stated_camera(text, image, where))
         chosen = chooser.info(option, topic).required(self.log, option)
-        camera = RosCamera.of(self.log.first(chosen), is_rectified(topic), f"{self.name}: {chosen}")
+        try:
+            camera = RosCamera.of(self.log.first(chosen), is_rectified(topic), f"{self.name}: {chosen}")
+        except DuagError as error:
+            option = option.removesuffix("_info")
+            raise DuagError(f"{error}, or --set {option}_camera='fx fy cx cy'") from error
         self._cameras[chosen] = (camera, is_rectified(topic))
         found = size_of(image, where)
         expected = camera.camera.width, camera.camera.height
@@ -161,7 +166,7 @@ class RobotLog:
             raise DuagError(
                 f"{where} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in {chosen}"
             )
-        return View(topic, image.header.frame_id, chosen, camera)
+        return ImageTopic(topic, image.header.frame_id, chosen, camera)
 
     @cached_property
     def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
@@ -216,6 +221,18 @@ class RobotLog:
         """True poses of the color camera, for evaluation only."""
         self._seen  # noqa: B018
         return self._motion.truth()
+
+    @property
+    def truth_world(self) -> str:
+        """Frame in which a topic states the true poses; empty: nothing does."""
+        self._seen  # noqa: B018
+        return self._motion.truth_world
+
+    @cached_property
+    def begin_ns(self) -> int:
+        """Time of the log of the first image, of color or of depth that keeps its time."""
+        depths = [depth for color, depth in self.pairs.items() if self.depth_stamp_ns(color) is not None]
+        return min([*self.pairs, *(depth for depth in depths if depth is not None)])
 
     def true_pose(self, stamp_ns: int | None) -> Array | None:
         """T_world_camera [4, 4] of the camera of the recording at a time of the log; None where it is not known."""
@@ -301,9 +318,11 @@ class RobotLog:
             away = nearest_s(
                 [d.stamp_ns for d in listed[self.depth]], [c.stamp_ns for c in listed[self.color]]
             )
+            other_clock = away > LONGEST_WAIT_S and settings.time_source == "header"
+            remedy = "time_source=log" if other_clock else "max_difference_s=SECONDS"
             raise DuagError(
                 f"{self.name}: no image on {self.depth} within {settings.limit_ns / NANOSECONDS:g} s of one on "
-                f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set max_difference_s=SECONDS"
+                f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set {remedy}"
             )
         pairs: dict[int, int | None] = {c.stamp_ns: d.stamp_ns for c, d in found}
         alone = [c.stamp_ns for c in listed[self.color] if c.stamp_ns not in pairs]

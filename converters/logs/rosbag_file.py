@@ -6,8 +6,9 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import Any
+from urllib.parse import quote
 
 from duagc.converters.logs import foxglove
 from duagc.converters.logs.bag_messages import messages
@@ -101,11 +102,19 @@ def _files_of(folder: Path) -> list[Path]:
     return [metadata, *(file for file in sorted(folder.iterdir()) if file.name in named)]
 
 
+class _UriPath(PosixPath):
+    """A path that f-strings write as in a URI: rosbags opens databases by such."""
+
+    def __format__(self, spec: str) -> str:
+        return quote(str(self))
+
+
 def _opened(path: Path) -> Any:
     """`AnyReader` of a bag; definitions of types that are not read here may be broken."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    path = _UriPath(path) if set("#%?") & set(str(path)) else path
     reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
     try:
         reader.open()
