@@ -44,7 +44,7 @@ class LogOptions(AssociationOptions, StereoOptions):
     """Namespaces of several robots in one log, separated by commas, for example "/acl_jackal,/sparkal1"; they name the
     robots, and stand for {namespace} in the names of other topics."""
     registered: Literal["auto", "yes", "no"] = "auto"
-    """Whether depth is seen from the color camera; auto: by name of the topic, frame and camera."""
+    """Whether depth is seen from the color camera; auto: by frame and camera, or by name with one of them."""
     T_color_depth: str = ""
     """Extrinsics "x y z qw qx qy qz" (m) of a depth camera, right camera or LiDAR that /tf_static does not know;
     x_color = T x_depth."""
