@@ -122,7 +122,8 @@ class LastGoodFrame:
 
     def _information(self, result: Registration, sigma_m: float) -> Array:
         """Of the pose in the keyframe: covariances of registration, of this frame's pose and of the translation add."""
-        depth_m = max(float(np.median(self._reference.levels[-1].points[:, 2])), 0.1)
+        points = next((of.points for of in reversed(self._reference.levels) if len(of)), np.zeros((1, 3)))
+        depth_m = max(float(np.median(points[:, 2])), 0.1)
         covariance = _covariance(result.information)
         covariance += sigma_m**2 * np.diag([1.0, 1.0, 1.0, *[depth_m**-2.0] * 3])
         if self.information is not None:

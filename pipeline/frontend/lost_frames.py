@@ -24,6 +24,7 @@ from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyfram
 from duagc.pipeline.frontend.tracking_state import features_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, RgbdPyramid
+from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.geometric_verification import (
     features_agree,
@@ -95,7 +96,11 @@ def _found(
     pyramid = images(frame.frame_index, len(config.tracking.strides))
     for keyframe, result in _registrations(frame, pyramid, [keyframes[n] for n in near], config):
         T_map_camera = T_map_keyframes[keyframe.keyframe_index] @ result.T_reference_target
-        if all(_within_reach(frame, T_map_camera, other, T_map_keyframes, config=config) for other in around):
+        seen_m = keyframe.median_depth_m
+        if all(
+            _within_reach(frame, T_map_camera, other, T_map_keyframes, seen_m=seen_m, config=config)
+            for other in around
+        ):
             return TrackedFrame.by(
                 frame.frame_index,
                 frame.stamp_ns,
@@ -163,6 +168,7 @@ def _within_reach(
     other: TrackedFrame,
     T_map_keyframes: Array,
     *,
+    seen_m: float,
     config: FrontendConfig,
 ) -> bool:
     """Whether a camera of finite speed can have been at two places at the times of two frames."""
@@ -170,4 +176,4 @@ def _within_reach(
     T_map_other = T_map_keyframes[other.keyframe_index] @ other.T_keyframe_camera
     elapsed_s = abs(frame.stamp_ns - other.stamp_ns) * 1e-9
     moved_m = float(se3.distance(T_map_camera, T_map_other)[0])
-    return moved_m <= limits.max_speed_m_s * elapsed_s + limits.slack_m
+    return moved_m <= (limits.max_speed_m_s * elapsed_s + limits.slack_m) * reach_factor(seen_m)

@@ -12,6 +12,7 @@ information (solution remapping: Zhang, Kaess and Singh 2016).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -25,6 +26,18 @@ from duagc.pipeline.registration.normal_equations import System, excess, regular
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
 from duagc.pipeline.registration.search import ALL_DIRECTIONS, orthonormal
+
+FAR_M = 6.0
+"""Median depth from which limits of distances grow in proportion: outdoors cameras move faster."""
+
+
+def reach_factor(median_depth_m: float) -> float:
+    """Factor of limits in meters that hold indoors.
+
+    Args:
+        median_depth_m: of what is seen; not finite: nothing.
+    """
+    return max(1.0, median_depth_m / FAR_M) if math.isfinite(median_depth_m) else 1.0
 
 
 class Outcome(Enum):
@@ -243,7 +256,10 @@ def _judge(
         outcome = Outcome.RESIDUAL
     elif weakest * config.max_sigma_m**2 < 1 - 1e-9:
         outcome = Outcome.ILL_CONDITIONED
-    elif moved_m > config.max_translation_m or turned_rad > config.max_rotation_rad:
+    elif (
+        moved_m > config.max_translation_m * reach_factor(system.seen.median_depth_m)
+        or turned_rad > config.max_rotation_rad
+    ):
         outcome = Outcome.JUMP
     else:
         outcome = Outcome.OK

@@ -13,6 +13,7 @@ from duagc.pipeline.registration import (
     RgbdPyramid,
     register,
 )
+from duagc.pipeline.registration.align import reach_factor
 from tests.fixtures.room import CAMERA, pose, render
 
 START, END = pose(yaw=0.3), pose(x=0.06, y=-0.03, z=-0.75, yaw=0.34, pitch=-0.02)
@@ -326,3 +327,16 @@ def test_known_noise_follows_the_pixels_down_the_pyramid():
         )
     samples = Reference.from_pyramid(view, STRIDES).levels[0]
     assert set(np.round(samples.depth_sigmas, 4)) <= {np.float32(0.002), np.float32(0.08)}
+
+
+def test_outdoors_the_limit_of_a_motion_grows_with_the_distance(reference, end):
+    """The same view eight times as large: what is 8 cm in a room is 0.6 m there."""
+    narrow = RegistrationConfig(max_translation_m=0.05)
+    assert register(reference, end, np.eye(4), narrow).outcome is Outcome.JUMP
+    factor = 8.0
+    far = [RgbdPyramid.build(gray, factor * depth, CAMERA) for gray, depth in (render(START), render(END))]
+    result = register(Reference.from_pyramid(far[0], STRIDES), far[1], np.eye(4))
+    assert result.ok
+    assert np.linalg.norm(result.T_reference_target[:3, 3]) > 0.5
+    assert reach_factor(2.0) == reach_factor(6.0) == reach_factor(np.inf) == 1.0
+    assert reach_factor(18.0) == 3.0
