@@ -82,7 +82,8 @@ class KeyframeConfig(Config):
     """A frame that turned by more than this becomes a keyframe."""
     max_depth_offset_s: float = 0.03
     """A frame whose depth was taken earlier or later by more than this becomes none: depth that is moved to the time of
-    its image is as good as the motion that is known."""
+    its image is as good as the motion that is known. In a log where hardly any depth is as near, those that are nearest
+    count."""
     neighbors: int = 4
     """Earlier keyframes that a new one is registered to, besides the one it was tracked against."""
     neighbor_overlap: float = 0.5
@@ -271,7 +272,7 @@ class TrackingConfig(Config):
     strides: tuple[PositiveInt, ...] = (4, 2, 1, 1)
     """Pixels between samples of a keyframe, per pyramid level, finest first."""
     max_extrapolation_s: float = 0.2
-    """Longest gap in time over which the last velocity predicts."""
+    """Longest gap in time over which the last velocity predicts; one and a half usual intervals if they are longer."""
     equalize_from_gain: float = 1.2
     """A frame that failed is tried again with brightness and contrast brought to those of the keyframe if the contrast
     differs by more than this factor."""

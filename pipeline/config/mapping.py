@@ -1,8 +1,10 @@
 """Configuration of the mapping."""
 
+import math
+from itertools import pairwise
 from typing import Literal
 
-from pydantic import Field, PositiveInt
+from pydantic import Field, PositiveInt, field_validator
 
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.training import DepthKind, LearningRates, MapLossConfig, SparseStepsConfig
@@ -11,12 +13,16 @@ THICKNESS_FLOOR_M = 1e-3
 """Thickness below which no splat differs from a plane: log-scales stop here, and have no information there."""
 
 
+EXACT_DEPTH_OF_DISTANCE = 1e-3
+"""Noise of exact depth is below this share of the distance: images of near things are less noisy, but not exact."""
+
+
 class SeedingConfig(Config):
     """Where Gaussians are inserted and what they look like at first."""
 
     cell_sizes_px: tuple[PositiveInt, ...] = (8, 4, 2)
     """Sides of the quadtree's cells, coarse to fine, each half of the one before."""
-    detail: float = 0.02
+    detail: float = Field(default=0.02, gt=0.0)
     """Standard deviation of gray (0..1) in a cell above which it is split; raised until the budget holds."""
     min_alpha: float = 0.6
     """Rendered opacity below which a pixel is not explained."""
@@ -37,10 +43,17 @@ class SeedingConfig(Config):
     thickness_m: float = Field(default=THICKNESS_FLOOR_M, gt=0.0)
     """Standard deviation of a disc across the surface at first; also the floor of every log-scale while mapping. A
     log-scale at the floor carries no information, and counts for nothing where maps are matched."""
-    min_depth_m: float = 0.2
+    min_depth_m: float = 0.1
     """Nearer depth gets no Gaussian."""
-    max_depth_m: float = 10.0
+    max_depth_m: float = 100.0
     """Farther depth gets no Gaussian."""
+
+    @field_validator("cell_sizes_px")
+    @classmethod
+    def _halves(cls, sides: tuple[int, ...]) -> tuple[int, ...]:
+        if not sides or any(coarse != 2 * fine for coarse, fine in pairwise(sides)):
+            raise ValueError(f"{list(sides)}, expected sides of cells, each half of the one before")
+        return sides
 
 
 class MappingConfig(Config):
@@ -108,13 +121,14 @@ class MappingConfig(Config):
     shutter: Literal["stated", "estimated"] = "stated"
     """How long the shutter is open, for views with motion blur where depth is not exact: as the log states it, else
     not at all; or, where it states nothing, estimated from the images, which takes about a third longer."""
-    stable_steps: int = 0
+    stable_steps: int = Field(default=0, ge=0, le=1023)
     """Steps after which a Gaussian is stable: frozen until the final optimization; 0: never."""
     depth: DepthKind | Literal["auto"] = "auto"
     """Depth of a Gaussian at a pixel: that of its center (`blended`), or of its disc along the ray (`ray_plane`).
     `auto`: `ray_plane` where the measured noise of the depth images is below `exact_depth_m`."""
     exact_depth_m: float = Field(default=0.002, ge=0.0)
-    """Depth that agrees this well from frame to frame determines the surface of every single Gaussian."""
+    """Depth that agrees this well from frame to frame, and to 0.1 % of its distance, determines the surface of every
+    single Gaussian."""
     loss: MapLossConfig = MapLossConfig()
     seeding: SeedingConfig = SeedingConfig()
     min_opacity: float = 0.03
@@ -132,15 +146,17 @@ class MappingConfig(Config):
     contribution_depth_sigma_m: float = 0.02
     """Noise of depth by which a change of an image is measured."""
 
-    def depth_kind(self, depth_noise_m: float | None) -> DepthKind:
+    def depth_kind(self, depth_noise_m: float | None, median_depth_m: float = math.inf) -> DepthKind:
         """How the depth of the Gaussians is drawn.
 
         Args:
             depth_noise_m: standard deviation of the depth images in meters; None: unknown.
+            median_depth_m: of what they show.
         """
         if self.depth != "auto":
             return self.depth
-        return "ray_plane" if depth_noise_m is not None and depth_noise_m < self.exact_depth_m else "blended"
+        limit_m = min(self.exact_depth_m, EXACT_DEPTH_OF_DISTANCE * median_depth_m)
+        return "ray_plane" if depth_noise_m is not None and depth_noise_m < limit_m else "blended"
 
     def final_steps(self, keyframes: float, views: float) -> float:
         """Steps of the final optimization of a tile, without a budget.

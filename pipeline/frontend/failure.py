@@ -229,6 +229,10 @@ class OcclusionDetector:
     Every view is compared with its keyframe and with the last view without an object. That one was taken nearby: what
     appears from one frame to the next is inside it, where the keyframe, from elsewhere, cannot judge what is near the
     lens. The keyframe is older: it also shows what came in slowly.
+
+    Attributes:
+        active: whether an object came and has not been seen to be gone.
+        occluded: whether the last view shows it.
     """
 
     def __init__(self, config: FailureConfig) -> None:
@@ -239,6 +243,7 @@ class OcclusionDetector:
         """
         self.config = config
         self.active = False
+        self.occluded = False
         self._unoccluded: tuple[Level, Array] | None = (
             None  # the last such view, coarse, and its T_map_camera
         )
@@ -250,8 +255,8 @@ class OcclusionDetector:
             view: its coarsest image.
             viewpoint: where it was tracked.
         """
-        occluded, visible = self.judge(view, viewpoint)
-        if occluded:
+        self.occluded, visible = self.judge(view, viewpoint)
+        if self.occluded:
             self.active = True
         elif visible >= self.config.min_visible * int(np.count_nonzero(view.inverse_depth)):
             self.active = False

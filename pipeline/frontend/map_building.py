@@ -18,6 +18,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.joint_training import JointTraining, JointView
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
@@ -54,7 +55,7 @@ class MapBuilder:
         *,
         name: str,
         exposures: ExposureTrack,
-        noise_m: float | None,
+        depth: DepthKind,
         seed: int,
         threads: SupportsIndex = 1,
         progress: bool = False,
@@ -67,7 +68,7 @@ class MapBuilder:
             config: of the front end.
             name: of the component.
             exposures: of its frames.
-            noise_m: of the depth images; None: unknown.
+            depth: of the Gaussians, as it is drawn.
             seed: of the run.
             threads: of the rasterizer; changes no bit.
             progress: whether it is shown.
@@ -75,8 +76,7 @@ class MapBuilder:
         """
         self._checkpoints = checkpoints
         self.log, self.config, self.name, self.exposures = log, config, name, exposures
-        self._seed, self._noise_m, self._threads, self._progress = seed, noise_m, threads, progress
-        self._depth = config.mapping.depth_kind(noise_m)
+        self._seed, self._depth, self._threads, self._progress = seed, depth, threads, progress
         self._budget = MappingBudget(config.mapping, log.camera)
         self._free = FreeSpace(log.camera, config.moving)
         self._whole = GrowingMap(config.mapping, threads=threads)
@@ -220,7 +220,7 @@ class MapBuilder:
             config,
             self._seed,
             threads=self._threads,
-            depth_noise_m=self._noise_m,
+            depth=self._depth,
             begun=begun,
             tile=number,
         )

@@ -22,7 +22,7 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.mapping import MappingConfig
-from duagc.pipeline.config.training import LearningRates
+from duagc.pipeline.config.training import DepthKind, LearningRates
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.map_content import MapContent
 from duagc.pipeline.frontend.mapping_budget import MappingBudget, alone_steps
@@ -113,7 +113,7 @@ class Mapper(MapContent):
         seed: int,
         *,
         threads: SupportsIndex = 1,
-        depth_noise_m: float | None = None,
+        depth: DepthKind | None = None,
         begun: GrowingMap | None = None,
         tile: int = 0,
     ) -> None:
@@ -125,13 +125,11 @@ class Mapper(MapContent):
             seed: of the run; random keyframes of the window and the order of the final optimization are drawn
                 from it.
             threads: of the rasterizer; changes no bit of the map.
-            depth_noise_m: standard deviation of the depth images, meters, for `config.depth` = auto; None:
-                unknown.
+            depth: of the Gaussians, as it is drawn; None: as configured, and of depth whose noise is unknown.
             begun: the Gaussians of a tile of the map; None: an empty map.
             tile: its number.
         """
-        depth = config.depth_kind(depth_noise_m)
-        super().__init__(camera, config, depth=depth, threads=threads, begun=begun)
+        super().__init__(camera, config, depth=depth or config.depth_kind(None), threads=threads, begun=begun)
         self.seed, self._tile = seed, tile
         self.budget = MappingBudget(config, camera)
         self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())

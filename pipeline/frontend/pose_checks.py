@@ -19,6 +19,7 @@ from duagc.pipeline.frontend.judgment import contradicts
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.features import matches
 from duagc.pipeline.registration.geometric_verification import angles_between, features_agree, judge_motion
 
@@ -169,10 +170,11 @@ class WithinReach:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
-        limits = state.config.tracking.failure
+        limits, keyframe = state.config.tracking.failure, state.keyframes[candidate.keyframe_index]
         elapsed_s = max(state.elapsed_s(frame.stamp_ns), 0.0)
         moved_m, _ = _from_prediction(state, frame, candidate)
-        return Reason.OBSTRUCTED if moved_m > limits.max_speed_m_s * elapsed_s + limits.slack_m else candidate
+        reach_m = (limits.max_speed_m_s * elapsed_s + limits.slack_m) * reach_factor(keyframe.median_depth_m)
+        return Reason.OBSTRUCTED if moved_m > reach_m else candidate
 
 
 class FeaturesConfirm:
@@ -236,11 +238,23 @@ def _features_prefer(T: Array, T_other: Array, keyframe: TrackedKeyframe, frame:
 def _from_prediction(
     state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
 ) -> tuple[float, float]:
-    """Distance in the map, meters, and angle, radians, of a candidate from the prediction."""
+    """Distance in the map, meters, and angle, radians, of a candidate from the prediction.
+
+    A camera may turn back between frames that are far apart: there the last pose is as good a prediction as the last
+    velocity, and the nearer one counts.
+    """
     keyframe, T = state.keyframes[candidate.keyframe_index], candidate.result.T_reference_target
-    T_map_expected = state.keyframe.T_map_keyframe @ state.predict(frame.stamp_ns).T_keyframe_camera
-    moved_m, turned_rad = se3.distance(T_map_expected, keyframe.T_map_keyframe @ T)
-    return float(moved_m), float(turned_rad)
+    predicted = state.predict(frame.stamp_ns)
+    expected = [predicted.T_keyframe_camera]
+    if (
+        predicted.information is None
+        and state.elapsed_s(frame.stamp_ns) > state.config.tracking.max_extrapolation_s
+    ):
+        expected.append(state.T_keyframe_camera)
+    T_map_expected = state.keyframe.T_map_keyframe @ np.stack(expected)
+    moved_m, turned_rad = se3.distance(T_map_expected, (keyframe.T_map_keyframe @ T)[None])
+    nearest = int(np.argmin(moved_m))
+    return float(moved_m[nearest]), float(turned_rad[nearest])
 
 
 FOLLOWED: tuple[PoseCheck, ...] = (WellConstrained(), MatchesPrediction(), DepthColorConsistency())

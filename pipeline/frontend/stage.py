@@ -19,15 +19,16 @@ from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.depth_delay import certain_delay_ns
+from duagc.pipeline.frontend.depth_quality import depth_noise_m, largest_depth_offset_s, median_depth_m
 from duagc.pipeline.frontend.exposure import ExposureEstimation
-from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector, Reason
+from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector
 from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
 from duagc.pipeline.frontend.kept_pyramids import KeptPyramids
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
@@ -123,6 +124,7 @@ def run_frontend(
                 threads=threads,
                 progress=progress,
                 noise_m=noise_m,
+                depth=config.mapping.depth_kind(noise_m, median_depth_m(tracked)),
                 clock=clock,
                 checkpoints=save,
             )
@@ -218,15 +220,18 @@ class _Tracking:
     def _tracker(self) -> SubmapTracker | OtherTracker:
         """As the configuration asks for; others than the usual one are imported by need."""
         camera, config = self.log.camera, self.config
+        limit_s = largest_depth_offset_s(self.log.pairing.offsets_ns, config.keyframes.max_depth_offset_s)
+        if config.tracking.method == "registration":
+            return SubmapTracker(camera, config, self.motion, max_depth_offset_s=limit_s)
+        keyframes = config.keyframes.model_copy(update={"max_depth_offset_s": limit_s})
+        config = config.model_copy(update={"keyframes": keyframes})
         if config.tracking.method == "rendering":
             from duagc.pipeline.frontend.rendering_tracker import RenderingTracker
 
             return RenderingTracker(camera, config, self.log.frame, seed=self.seed, threads=self.threads)
-        if config.tracking.method == "open3d":
-            from duagc.pipeline.frontend.open3d_tracker import Open3dTracker
+        from duagc.pipeline.frontend.open3d_tracker import Open3dTracker
 
-            return Open3dTracker(camera, config, self.log.frame)
-        return SubmapTracker(camera, config, self.motion)
+        return Open3dTracker(camera, config, self.log.frame)
 
 
 def _trajectories(tracked: TrackedLog) -> list[Trajectory]:
@@ -259,6 +264,7 @@ class _ComponentStage:
         threads: of the rasterizer.
         progress: whether it is shown.
         noise_m: noise of the depth images.
+        depth: of the Gaussians, as it is drawn.
         clock: of the stage.
         checkpoints: of the stage.
     """
@@ -270,6 +276,7 @@ class _ComponentStage:
     threads: SupportsIndex
     progress: bool
     noise_m: float | None
+    depth: DepthKind
     clock: LapTimes
     checkpoints: Checkpoints
 
@@ -339,7 +346,7 @@ class _ComponentStage:
         """Build the map, if the configuration asks for one."""
         if not self.config.mapping_enabled:
             self.clock.lap("mapping_s")
-            maps = Maps(Gaussians.empty(), None, self.config.mapping.depth_kind(self.noise_m))
+            maps = Maps(Gaussians.empty(), None, self.depth)
             return BuiltMap([], maps, frames, np.array([k.T_map_camera for k in keyframes]))
         from duagc.pipeline.frontend.map_building import MapBuilder
 
@@ -348,30 +355,10 @@ class _ComponentStage:
             self.config,
             name=self.name,
             exposures=exposures,
-            noise_m=self.noise_m,
+            depth=self.depth,
             seed=self.seed,
             threads=self.threads,
             progress=self.progress,
             checkpoints=self.checkpoints,
         )
         return builder.build(keyframes, frames, self.clock)
-
-
-def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
-    """Noise of the depth images, meters: the median depth residual of registration over frames that are not held out.
-
-    Args:
-        frames: of the log, as tracked.
-
-    Returns:
-        The noise; None if no frame was tracked with depth.
-    """
-    rms_m = [
-        frame.rms_depth_m
-        for frame in frames
-        if frame.status is Status.OK
-        and frame.reason is Reason.NONE
-        and frame.rms_depth_m > 0
-        and not is_held_out(frame.frame_index)
-    ]
-    return float(np.median(rms_m)) if rms_m else None

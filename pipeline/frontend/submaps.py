@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,12 @@ class SubmapTracker:
     """Tracks one camera in as many submaps as it takes. Feed it the frames in order."""
 
     def __init__(
-        self, camera: PinholeCamera, config: FrontendConfig, motion: MotionPrior | None = None
+        self,
+        camera: PinholeCamera,
+        config: FrontendConfig,
+        motion: MotionPrior | None = None,
+        *,
+        max_depth_offset_s: float | None = None,
     ) -> None:
         """Begin without a keyframe.
 
@@ -91,9 +97,11 @@ class SubmapTracker:
             camera: of all frames.
             config: of the front end.
             motion: how the camera moved by other sensors, where the log has any.
+            max_depth_offset_s: as of `Tracker`.
         """
-        self.camera, self.config, self.motion = camera, config, motion
-        self._trackers = [Tracker(camera, config, motion)]
+        self._begin = partial(Tracker, camera, config, motion, max_depth_offset_s=max_depth_offset_s)
+        self.config = config
+        self._trackers = [self._begin()]
         self._current = 0
         self._candidate: _Candidate | None = None
         self._frames: list[TrackedFrame] = []
@@ -172,7 +180,7 @@ class SubmapTracker:
             else:
                 self._candidate.frames[at] = tracked
         if self._candidate is None and reason not in _UNUSABLE_IMAGES:
-            tracker = Tracker(self.camera, self.config, self.motion)
+            tracker = self._begin()
             tracked = tracker.track_frame(frame)
             if tracked.status is not Status.LOST:
                 self._candidate = _Candidate(tracker, {at: tracked})

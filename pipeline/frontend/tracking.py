@@ -40,7 +40,12 @@ class Tracker:
     """Tracks one camera. Feed it the frames in order."""
 
     def __init__(
-        self, camera: PinholeCamera, config: FrontendConfig, motion: MotionPrior | None = None
+        self,
+        camera: PinholeCamera,
+        config: FrontendConfig,
+        motion: MotionPrior | None = None,
+        *,
+        max_depth_offset_s: float | None = None,
     ) -> None:
         """Begin without a keyframe.
 
@@ -48,9 +53,13 @@ class Tracker:
             camera: of all frames.
             config: of the front end.
             motion: how the camera moved by other sensors, where the log has any.
+            max_depth_offset_s: by which depth may be earlier or later than its color, of a frame that others are
+                registered to; None: as configured.
         """
         self.camera = camera
-        self.state = TrackingState(config, motion)
+        if max_depth_offset_s is None:
+            max_depth_offset_s = config.keyframes.max_depth_offset_s
+        self.state = TrackingState(config, motion, max_depth_offset_s)
         self._relocalizer = Relocalizer()
 
     @property
@@ -120,12 +129,12 @@ class Tracker:
         """
         tracking, offset_ns = self.state.config.tracking, images.depth_offset_ns
         depth = DepthImage(images.depth_m, images.depth_sigma_m)
-        if not images.depth_moved and not self._is_near(offset_ns):
+        if not images.depth_moved and abs(offset_ns) * 1e-9 > self.state.config.keyframes.max_depth_offset_s:
             T_color_depth = self.state.depth_motion(images.stamp_ns, offset_ns)
-            if T_color_depth is None:
-                depth = DepthImage(np.zeros_like(images.depth_m), images.depth_sigma_m)
-            else:
+            if T_color_depth is not None:
                 depth = move_depth(depth, self.camera, T_color_depth)
+            elif not self._is_near(offset_ns):
+                depth = DepthImage(np.zeros_like(images.depth_m), images.depth_sigma_m)
         pyramid = RgbdPyramid.build(
             images.image,
             depth.depth_m,
@@ -269,12 +278,24 @@ class Tracker:
             and self._is_near(frame.depth_offset_ns)
             and becomes_keyframe(found.result, frame.pyramid, self.state.config.keyframes)
             and self._is_well_exposed(frame.pyramid, found.result)
-            and not self.state.occlusion.active
+            and self._is_unoccluded(found.result)
         )
+
+    def _is_unoccluded(self, result: Registration) -> bool:
+        """Whether no object is in front of the camera.
+
+        Where a camera goes on, most of its view can no more be judged, and an object never be seen to be gone. A frame
+        that leaves its keyframe then becomes one if nothing in it is in free space: else the camera would be lost.
+        """
+        occlusion = self.state.occlusion
+        leaving = min(result.overlap, result.view) < self.state.config.tracking.relocalization.min_overlap
+        if leaving and not occlusion.occluded:
+            occlusion.active = False
+        return not occlusion.active
 
     def _is_near(self, depth_offset_ns: int) -> bool:
         """Whether depth was taken so near in time to its color that others may be registered to it."""
-        return abs(depth_offset_ns) * 1e-9 <= self.state.config.keyframes.max_depth_offset_s
+        return abs(depth_offset_ns) * 1e-9 <= self.state.max_depth_offset_s
 
     def _is_well_exposed(self, pyramid: RgbdPyramid, result: Registration) -> bool:
         """Whether a frame looks as its keyframe does; or, hardly saturated, leaves it or drifts from its exposure.

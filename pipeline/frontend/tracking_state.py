@@ -27,6 +27,8 @@ from duagc.pipeline.recording import Motion, MotionPrior
 from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract_from_pyramid
 
+EXTRAPOLATED_INTERVALS = 1.5
+"""Usual intervals between frames over which a velocity predicts in any case."""
 RECENT_FRAMES = 7  # whose mean velocity moves depth of another time
 
 
@@ -103,6 +105,8 @@ class TrackingState:
     Attributes:
         config: of the front end.
         motion: how the camera moved by other sensors, where the log has any.
+        max_depth_offset_s: by which depth may be earlier or later than its color, of a frame that others are
+            registered to.
         keyframes: all of them.
         pairs: registrations between keyframes.
         keyframe_index: the keyframe that frames are tracked against.
@@ -127,6 +131,7 @@ class TrackingState:
 
     config: FrontendConfig
     motion: MotionPrior | None = None
+    max_depth_offset_s: float = 0.0
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
     pairs: list[RelativePose] = field(default_factory=list)
     keyframe_index: int = 0
@@ -197,8 +202,7 @@ class TrackingState:
             stamp_ns: the time.
         """
         last, elapsed_s = self.T_keyframe_camera, self.elapsed_s(stamp_ns)
-        fresh = elapsed_s <= self.config.tracking.max_extrapolation_s
-        followed = last @ se3.exp(self.velocity * elapsed_s) if fresh else last
+        followed = last @ se3.exp(self.velocity * elapsed_s) if self._is_fresh(elapsed_s) else last
         motion = self._moved(self.stamp_ns, stamp_ns)
         if motion is None:
             return Prediction(followed, None, self._deviation_px(elapsed_s, turns=True))
@@ -281,12 +285,18 @@ class TrackingState:
 
     def _mean_motion(self, stamp_ns: int, duration_ns: int) -> Array | None:
         """Motion [4, 4] of the camera in some time at the mean velocity of the last frames; None if unknown."""
-        fresh = self.elapsed_s(stamp_ns) <= self.config.tracking.max_extrapolation_s
-        if self.lost or not fresh or len(self.recent) < 2:
+        if self.lost or not self._is_fresh(self.elapsed_s(stamp_ns)) or len(self.recent) < 2:
             return None
         (first_ns, T_map_first), (last_ns, T_map_last) = self.recent[0], self.recent[-1]
         share = duration_ns / max(last_ns - first_ns, 1)
         return np.asarray(se3.exp(share * se3.log(se3.inverse(T_map_first) @ T_map_last)))
+
+    def _is_fresh(self, elapsed_s: float) -> bool:
+        """Whether the last velocity still predicts; from one frame to the next it does, however slow the camera."""
+        longest_s = max(
+            self.config.tracking.max_extrapolation_s, EXTRAPOLATED_INTERVALS * self.intervals.median_s
+        )
+        return elapsed_s <= longest_s
 
     def is_long_lost(self, stamp_ns: int) -> bool:
         """Whether the camera is lost for so long that its last velocity means nothing any more.

@@ -43,6 +43,7 @@ def test_the_motion_of_another_component_is_forgotten(
         threads=1,
         progress=False,
         noise_m=None,
+        depth="blended",
         clock=LapTimes(),
         checkpoints=NO_CHECKPOINTS,
     )

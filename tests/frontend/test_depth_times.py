@@ -8,6 +8,7 @@ import pytest
 
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
+from duagc.pipeline.frontend.depth_quality import largest_depth_offset_s
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import read_log
@@ -77,3 +78,37 @@ def test_depth_that_is_late_and_early_in_turn_is_moved(tmp_path: Path) -> None:
     moved = errors_m(tracked(write(tmp_path / "moved", 0, 14_000_000, early=True)))
     taken = errors_m(tracked(write(tmp_path / "taken", 0, 14_000_000, stated=False, early=True)))
     assert np.sqrt(np.mean(moved**2)) < 0.5 * np.sqrt(np.mean(taken**2))
+
+
+def slow_log(folder: Path, late_ns: int, stated: bool, frames: int) -> Path:
+    """Ten images a second; depth is always taken some time after them."""
+    with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
+        for k in range(frames):
+            gray, depth_m = render(walk(3 * k))[0], render(walk(3 * (k + late_ns / 1e8)))[1]
+            image = np.repeat(np.rint(np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2)
+            stamp_ns = k * 100_000_000
+            robot.add_frame(
+                stamp_ns,
+                cv2.imencode(".png", image)[1].tobytes(),
+                "png",
+                np.rint(depth_m / 0.0005).astype(np.uint16),
+                depth_stamp_ns=stamp_ns + late_ns if stated else None,
+            )
+    return folder / "alpha.mcap"
+
+
+def test_depth_that_is_never_near_in_time_makes_a_map(tmp_path: Path) -> None:
+    frames = tracked(slow_log(tmp_path / "rec", 40_000_000, stated=True, frames=10))
+    assert [f.status for f in frames] == ["ok"] * 10
+    T_first = se3.inverse(frames[0].T_map_camera)
+    for k, found in enumerate(frames):
+        T_true = se3.inverse(walk(0)) @ walk(3 * k)
+        assert se3.distance(T_first @ found.T_map_camera, T_true)[0] < 0.01
+
+
+def test_how_near_depth_must_be_is_by_the_log() -> None:
+    offsets = np.array([1, -2, 3, 40, 90, -100, 70, 80, 20, 60]) * 1_000_000
+    assert largest_depth_offset_s(offsets, 0.03) == 0.03
+    assert largest_depth_offset_s(offsets + 200_000_000, 0.03) > 0.1
+    assert largest_depth_offset_s(np.full(20, -40_000_000), 0.03) == pytest.approx(0.05)
+    assert largest_depth_offset_s(np.zeros(0, np.int64), 0.03) == 0.03

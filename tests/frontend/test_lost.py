@@ -7,6 +7,7 @@ a slow test.
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import pytest
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments import disturbances as d
 from duagc.pipeline.experiments.disturbances import DisturbanceRow, Shot, Undisturbed
+from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.failure import FrozenImageDetector, Reason, free_space_violations
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
@@ -21,6 +23,9 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
 from tests.fixtures.films import CAMERA, FRAMES, filmed
+from tests.fixtures.room import CAMERA as ROOM_CAMERA
+from tests.fixtures.room import pose as room_pose
+from tests.fixtures.room import render
 from tests.fixtures.sampling import sampled
 from tests.frontend.conftest import CONFIG, STARTS
 
@@ -283,3 +288,32 @@ def test_red_kitchen_is_never_silently_wrong(
             found += rows[-1].good
     assert not wrong
     assert found >= 0.9 * len(starts) * len(every)
+
+
+def test_thin_depth_says_how_well_color_alone_is_known() -> None:
+    """A strip of depth has no sample in the coarsest image: the finest one says how far things are."""
+    gray, depth_m = render(room_pose())
+    strip = np.zeros_like(depth_m)
+    strip[60:64] = depth_m[60:64]
+    good = LastGoodFrame(RgbdPyramid.build(gray, strip, ROOM_CAMERA, 4), (2, 1, 1, 1), np.eye(4), None)
+    later = RgbdPyramid.build(gray, np.zeros_like(depth_m), ROOM_CAMERA, 4)
+    tracking = FrontendConfig().tracking
+    found = good.register_color(
+        later, np.eye(4), tracking.registration, tracking.failure, prior_information=None
+    )
+    assert np.isfinite(found.information).all()
+
+
+def test_an_object_does_not_hold_back_a_keyframe_where_the_camera_leaves_the_view() -> None:
+    """What was seen before can no more tell that the object is gone."""
+    tracker = Tracker(ROOM_CAMERA, FrontendConfig())
+    occlusion = tracker.state.occlusion
+    for occluded, overlap, free in [
+        (True, 0.3, False),
+        (False, 0.7, False),
+        (False, 0.3, True),
+        (False, 0.7, True),
+    ]:
+        occlusion.active = not free or occlusion.active
+        occlusion.occluded = occluded
+        assert tracker._is_unoccluded(SimpleNamespace(overlap=overlap, view=0.9)) is free

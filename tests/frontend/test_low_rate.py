@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from duagc.pipeline.experiments.disturbances import Shot, Undisturbed, track
 from duagc.pipeline.frontend.tracked import Status
@@ -46,3 +47,20 @@ def test_a_camera_that_turns_back_at_a_low_rate_is_followed(run: Undisturbed) ->
         moved_m, turned_rad = se3.distance(run.poses[k], T_map_camera)
         assert moved_m < 0.005
         assert turned_rad < 0.003
+
+
+@pytest.mark.parametrize("interval_s", [0.033, 0.2, 0.25, 0.4])
+def test_the_last_velocity_predicts_the_next_frame_at_any_rate(run: Undisturbed, interval_s: float) -> None:
+    tracker = Tracker(CAMERA, CONFIG)
+    track(tracker, replace(run.shots[0], index=0, stamp_ns=0))
+    state = tracker.state
+    for k in range(1, 4):
+        state.intervals.update(round(k * interval_s * 1e9))
+    state.stamp_ns = round(3 * interval_s * 1e9)
+    state.velocity = np.array([0.3, 0, 0, 0, 0.1, 0])
+    late_s = interval_s + 0.01  # no camera is exact
+    predicted = state.predict(state.stamp_ns + round(late_s * 1e9))
+    assert se3.distance(predicted.T_keyframe_camera, se3.exp(late_s * state.velocity))[0] < 1e-6
+    gap_s = 0.19 if interval_s < 0.1 else 0.0
+    after = state.predict(state.stamp_ns + round((2.0 * max(interval_s, 0.2) + gap_s) * 1e9))
+    np.testing.assert_array_equal(after.T_keyframe_camera, np.eye(4))

@@ -153,7 +153,7 @@ def _wrong_by_m(mapper: Mapper, T_true: np.ndarray) -> float:
 def test_a_pose_that_is_off_is_refined_unless_depth_is_exact(noise_m: float) -> None:
     """Exact depth gives exact poses: what the map could add is less than what it lacks. A pixel is 6 cm here."""
     config = MappingConfig(max_gaussians=4000, iterations=12, final_iterations=40, pose_rate=0.4)
-    mapper = Mapper(CAMERA, config, seed=5, depth_noise_m=noise_m)
+    mapper = Mapper(CAMERA, config, seed=5, depth=config.depth_kind(noise_m))
     off = POSES[2] @ se3.exp(np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0]))
     for k, T in enumerate((POSES[0], POSES[1], off)):
         mapper.add_keyframe(k, *shot(POSES[k]), T)
@@ -278,7 +278,7 @@ def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
 
 def test_how_depth_is_drawn_follows_from_its_noise() -> None:
     def mapper(noise_m: float | None, config: MappingConfig = QUICK) -> Mapper:
-        return Mapper(CAMERA, config, seed=0, depth_noise_m=noise_m)
+        return Mapper(CAMERA, config, seed=0, depth=config.depth_kind(noise_m))
 
     assert [mapper(noise_m).depth for noise_m in (0.0005, 0.002, 0.007, None)] == [
         "ray_plane", "blended", "blended", "blended",
@@ -345,3 +345,12 @@ def test_gaussians_stop_at_the_largest_scale_and_stay() -> None:
     at_the_limit = largest == np.float32(np.log(0.06))
     assert at_the_limit.any()
     assert largest.max() <= np.float32(np.log(0.06))
+
+
+def test_near_things_are_not_exact_because_their_noise_is_small() -> None:
+    config = MappingConfig()
+    assert config.depth_kind(0.0005, 2.5) == "ray_plane"
+    assert config.depth_kind(0.0005) == "ray_plane"
+    assert config.depth_kind(0.0015, 0.8) == "blended"  # a Kinect before a desk
+    assert config.depth_kind(0.003, 5.0) == "blended"
+    assert config.depth_kind(None, 2.5) == "blended"

@@ -36,7 +36,7 @@ def room_map(seed: int) -> Gaussians:
     config = MappingConfig(
         max_gaussians=20000, iterations=20, final_iterations=60, pose_rate=0.0, sparse=whole
     )
-    mapper = Mapper(CAMERA, config, seed=seed, depth_noise_m=0.005)
+    mapper = Mapper(CAMERA, config, seed=seed, depth="blended")
     for k, T in enumerate((KEYFRAME, pose(x=-0.1, z=-0.9), pose(x=0.12, z=-0.85, yaw=0.05))):
         mapper.add_keyframe(k, *image(T), se3.inverse(KEYFRAME) @ T)
     mapper.finalize()

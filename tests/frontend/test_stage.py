@@ -12,11 +12,12 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.frontend.depth_quality import depth_noise_m
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.frontend.output import LATENCY_NS
-from duagc.pipeline.frontend.stage import depth_noise_m, run_frontend
+from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.frontend.supporting_frames import supporting_frames
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.view_gain import ViewGain

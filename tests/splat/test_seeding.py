@@ -96,7 +96,7 @@ def test_a_disc_belongs_to_one_surface() -> None:
 
 def test_missing_depth_gives_no_disc() -> None:
     assert len(seeded(np.zeros((CAMERA.height, CAMERA.width), np.float32), stripes())) == 0
-    assert len(seeded(plane((0, 0, -1), 50.0), stripes())) == 0  # beyond the sensor's range
+    assert len(seeded(plane((0, 0, -1), 150.0), stripes())) == 0  # beyond the sensor's range
 
 
 def test_a_seeded_view_is_explained_and_a_changed_one_is_not() -> None:
@@ -127,3 +127,19 @@ def test_pixels_of_some_cells_are_those_of_all(shape, side):
     found, wanted = seeding._pixels_of(cells, image, side), every[:, cells]
     np.testing.assert_array_equal(found, wanted)
     assert found.strides == wanted.strides
+
+
+@pytest.mark.parametrize("distance_m", [0.15, 2.0, 40.0])
+def test_near_and_far_surfaces_get_discs(distance_m: float) -> None:
+    discs = seeded(plane((0.0, 0.0, -1.0), distance_m), stripes())
+    in_camera = se3.transform(se3.inverse(T_MAP_CAMERA), discs.means.astype(np.float64))
+    assert len(discs) > 40
+    np.testing.assert_allclose(in_camera[:, 2], distance_m, rtol=1e-3)
+
+
+def test_cells_that_do_not_nest_and_no_detail_at_all_are_refused() -> None:
+    for sides in [(8, 2), (2, 4), (8, 4, 3), ()]:
+        with pytest.raises(ValueError, match="each half of the one before"):
+            SeedingConfig(cell_sizes_px=sides)
+    with pytest.raises(ValueError, match="greater than 0"):
+        SeedingConfig(detail=0.0)
