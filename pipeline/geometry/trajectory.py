@@ -91,13 +91,15 @@ def _nanoseconds(text: str) -> int:
 
 
 def associate(a: Trajectory, b: Trajectory, tolerance_ns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (into a, into b) of paired poses: for each pose of the shorter one the nearest of the other.
+    """Indices (into a, into b) of paired poses: for each pose of a the nearest of b.
 
-    Pairs further apart than `tolerance_ns` are left out (the rule of the evo package).
+    Every pose of a is in at most one pair. With the shorter trajectory as a, this is the rule of the evo package.
+
+    Args:
+        a: whose poses are paired.
+        b: where their partners are sought; one may be the nearest of several.
+        tolerance_ns: pairs further apart are left out.
     """
-    if len(a) > len(b):
-        j, i = associate(b, a, tolerance_ns)
-        return i, j
     after = np.clip(np.searchsorted(b.stamps_ns, a.stamps_ns), 1, max(len(b) - 1, 1))
     neighbors = np.minimum(np.stack([after - 1, after]), len(b) - 1)
     gaps = np.abs(b.stamps_ns[neighbors] - a.stamps_ns)

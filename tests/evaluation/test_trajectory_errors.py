@@ -57,9 +57,26 @@ def test_steps_across_missing_frames_count_nowhere():
 
 def test_frames_without_ground_truth_are_left_out():
     path = curved_path()
-    true = Trajectory(STAMPS[:20] + 15_000_000, path[:20])
+    true = Trajectory(STAMPS[:20] + 10_000_000, path[:20])  # the 21st frame is 23 ms after the last one
     pairs = trajectory_errors.pair(true, Trajectory(STAMPS, path))
     assert pairs.stamps_ns.tolist() == STAMPS[:20].tolist()
+
+
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (25, 60)])
+def test_every_frame_is_paired_at_most_once_however_few_poses_the_truth_has(rate_hz, seconds):
+    """60 s at 30 Hz; the truth covers them in part, or is slower than the camera."""
+
+    def circle(t_s):
+        poses = se3.exp(np.stack([0 * t_s, 0 * t_s, 0 * t_s, 0 * t_s, t_s / 10, 0 * t_s], axis=1))
+        poses[:, :3, 3] = np.stack([10 * np.sin(t_s / 10), 0 * t_s, 10 * np.cos(t_s / 10)], axis=1)
+        return Trajectory(np.rint(t_s * 1e9).astype(np.int64), poses)
+
+    estimated, true = circle(np.arange(1800) / 30), circle(np.arange(rate_hz * seconds) / rate_hz)
+    assert len(true) < len(estimated)
+    pairs = trajectory_errors.pair(true, estimated)
+    gaps_ns = np.abs(true.stamps_ns - estimated.stamps_ns[:, None]).min(axis=1)
+    assert pairs.stamps_ns.tolist() == estimated.stamps_ns[gaps_ns <= 20_000_000].tolist()
+    assert isinstance(trajectory_errors.rpe(pairs, estimated.stamps_ns), tuple)
 
 
 @pytest.mark.parametrize("n", [0, 2])
