@@ -165,8 +165,8 @@ class Agent:
         """Give up neighbors that were silent for too long; do not wait for them any more.
 
         A link that died during the pose rounds would leave its two ends with different last packets of each other,
-        so the rest of the team begins again without it. If no neighbor is left, or one has agreed already, the poses
-        stay as they are.
+        so the rest of the team begins again without it. If no neighbor is left or still heard, or one has agreed
+        already, the poses stay as they are.
         """
         died = 0
         for neighbor in self.radio.in_contact:
@@ -177,7 +177,7 @@ class Agent:
                 neighbor.lost = True
         others = self.radio.joined
         final = self.agreed or any(n.state is not None and n.state.agreed for n in others)
-        if died and others and not final:
+        if died and not final and any(n.transport.in_contact(self.round) for n in others):
             self._revoke_links(self.alignment.revoked | died)
 
     # --- incoming
@@ -388,7 +388,7 @@ class Agent:
             return
         if self.alignment_hops == WHOLE_COMPONENT and not self.radio.joined:
             self.done = True  # alone from the start, or all neighbors were given up
-            self.converged = self.poses is None
+            self.converged = self.poses is None and self.alignment.members == [self.own]
             return
         members = self.alignment.members
         if self.agreed and self.sharing.complete(members):

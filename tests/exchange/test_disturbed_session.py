@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.exchange import ExchangeConfig, InjectionConfig
-from duagc.pipeline.config.network import LinkConfig, TransportConfig
+from duagc.pipeline.config.network import LinkConfig, LinkWindow, TransportConfig
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.replay import replay_agent_of
@@ -169,6 +169,33 @@ def test_a_link_that_dies_leaves_the_way_around(team: Team, tmp_path: Path) -> N
         assert result.component == NAMES
         assert error_m(result, team) < 0.02
         assert set(result.evidence) == set(NAMES) - {name}
+
+
+@pytest.mark.parametrize("left_round", sampled([20, 30]))
+def test_a_robot_that_leaves_keeps_its_poses_and_is_not_done(
+    team: Team, tmp_path: Path, left_round: int
+) -> None:
+    """Charlie loses alpha while the poses move, and bravo three rounds later; the other two go on without it."""
+    until_ns, later_ns = (r * ExchangeConfig().period_ns for r in (left_round, left_round + 3))
+    windows = (
+        LinkWindow(sender="alpha", receiver="bravo"),
+        LinkWindow(sender="alpha", receiver="charlie", until_ns=until_ns),
+        LinkWindow(sender="bravo", receiver="charlie", until_ns=later_ns),
+    )
+    link = LinkConfig(topology="listed", windows=windows)
+    transport = TransportConfig(contact_lost_after_rounds=12, silent_after_rounds=40)
+    results = meet(team, 3, tmp_path, link=link, transport=transport)
+    rounds = [r.message() for r in read_log(tmp_path / "consensus.mcap", ["/charlie/consensus/agent"])]
+    assert rounds[-1].done
+    assert rounds[-1].revoked_links == 0
+    left = results["charlie"]
+    assert (left.agreed, left.converged) == (False, False)
+    assert left.component == NAMES
+    assert error_m(left, team) < 0.02
+    for name in NAMES[:2]:
+        assert results[name].component == NAMES[:2]
+        assert results[name].converged
+        assert error_m(results[name], team) < 0.02
 
 
 def test_a_link_in_one_direction_is_no_link(team: Team, tmp_path: Path) -> None:
