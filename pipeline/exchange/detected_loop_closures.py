@@ -36,6 +36,7 @@ from duagc.pipeline.exchange.loop_closing import (
     LoopClosureProtocol,
     Send,
     Tried,
+    can_be_sent,
     join,
 )
 from duagc.pipeline.exchange.own_graph import OwnGraph
@@ -341,7 +342,7 @@ class Verifier(LoopClosureProtocol):
                     self.tried[at] = Tried(t.candidate, result)
         if consistency.T_ownmap_peermap is not None:
             groups = (Group(consistency.keep, consistency.T_ownmap_peermap), *consistency.others)
-            self.joined = join(
+            joined = join(
                 closures,
                 groups,
                 self.database.graph.from_first,
@@ -349,6 +350,10 @@ class Verifier(LoopClosureProtocol):
                 agreement=self._agreement,
                 config=self.config.consensus.closures,
             )
+            if can_be_sent(self.own, self.peer, joined.proposals):
+                self.joined = joined
+            else:
+                self._refuse("the map of the neighbor would lie beyond what can be sent")
         self.samples.clear()
         self.compact = []
         verdicts = Verdicts(
@@ -360,6 +365,13 @@ class Verifier(LoopClosureProtocol):
         )
         self.decided = True
         send(Kind.CLOSURES, loop_closing_wire.write_verdicts(verdicts))
+
+    def _refuse(self, reason: str) -> None:
+        """No loop closure counts."""
+        for at, t in enumerate(self.tried):
+            if t.result.closure is not None and t.result.verdict is Verdict.KEPT:
+                result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
+                self.tried[at] = Tried(t.candidate, result)
 
     def _agreement(self, group: Group) -> float:
         """Share of the neighbor's samples that own depth images confirm, where a group places its map."""

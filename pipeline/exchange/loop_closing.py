@@ -18,7 +18,12 @@ from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes, link_metric
 from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.verification import Verified
-from duagc.pipeline.network.packets import Kind
+from duagc.pipeline.exchange.wire.state_wire import (
+    RelativeFrames,
+    read_relative_frames,
+    write_relative_frames,
+)
+from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.posegraph.cycle_consistency import Proposal
 from duagc.pipeline.posegraph.loop_closures import Group, KeyframePoses, frame_variance
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
@@ -71,6 +76,23 @@ def join(
         variance = frame_variance(agreeing, own, peer, config)
         proposals.append(Proposal(len(agreeing), group.T_ownmap_peermap, variance, agreement(group)))
     return JoinedPair(shared, tuple(closures), tuple(g.keep for g in groups), tuple(proposals))
+
+
+def can_be_sent(own: str, peer: str, proposals: tuple[Proposal, ...]) -> bool:
+    """Whether other robots will read these relative frames: motions within the range of the format.
+
+    Args:
+        own: name of the robot whose frame comes first in them.
+        peer: name of the other one.
+        proposals: one at least.
+    """
+    if peer < own:  # as they are sent
+        proposals = tuple(p.reversed() for p in proposals)
+    try:
+        read_relative_frames(write_relative_frames(RelativeFrames(0, 1, proposals)), 2)
+    except MalformedError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)

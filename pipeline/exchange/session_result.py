@@ -140,11 +140,11 @@ def _weight(agent: MapAgent, n: Neighbor, closure: LoopClosure) -> float | None:
     """Robust weight of a loop closure at the end, or when its link was revoked; None if it took no part."""
     if n.loop_closing is None or n.loop_closing.joined is None:
         return None
-    if n.link.revoked:
-        weights = n.link.weights
+    held = n.loop_closing.joined.closures
+    if n.link.revoked:  # without weights: a state revoked the link before this robot had decided on it
+        weights = n.link.weights or [0.0] * len(held)
     elif agent.poses is not None and n.index in agent.links:
         weights = agent.poses.weights(n.name).tolist()
     else:
         return None
-    held = n.loop_closing.joined.closures
     return next((w for w, other in zip(weights, held, strict=True) if other is closure), None)
