@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import PosePacket, rounded
 from duagc.pipeline.consensus.pose_admm import with_floor
@@ -120,7 +121,12 @@ class Algorithm1Solver:
         self._match()
         if any(peer.poses is None for peer in self._peers.values()):
             return
-        x = self._gradient_step() if self.printed else self._newton_step()
+        try:
+            x = self._gradient_step() if self.printed else self._newton_step()
+        except DuagError as error:  # numbers that a neighbor sent; the poses stay
+            self._step, self._still = np.inf, 0
+            self.refused.append(str(error))
+            return
         self._step = float(np.abs(least_squares.difference(x, self._x)).max())
         self._x = x
         self._still = self._still + 1 if self._step < self.config.tolerance else 0
@@ -321,7 +327,10 @@ class Algorithm1Solver:
         largest = 0.0
         for peer in self._peers.values():
             if peer.poses is not None and len(peer.between):
-                r = np.linalg.solve(peer.between.whitening, self._residuals(peer)[..., None])
+                try:
+                    r = np.linalg.solve(peer.between.whitening, self._residuals(peer)[..., None])
+                except np.linalg.LinAlgError:  # a neighbor's loop closure that says nothing of some direction
+                    r = least_squares.errors(peer.between, np.concatenate([self._x, peer.poses]))
                 largest = max(largest, float(np.abs(r).max()))
         return largest
 

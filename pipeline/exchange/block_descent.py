@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import STEADY, PosePacket, rounded
 from duagc.pipeline.consensus.own_block import minimized
@@ -146,7 +147,12 @@ class BlockDescentSolver:
             return
         self._weigh()
         factors, weights, held = self._block()
-        x = minimized(factors, weights, self._x, held, config=self.config)
+        try:
+            x = minimized(factors, weights, self._x, held, config=self.config)
+        except DuagError as error:  # numbers that a neighbor sent; the poses stay
+            self._change, self._still = np.inf, 0
+            self.refused.append(str(error))
+            return
         self._change = float(np.abs(least_squares.difference(x, self._x)).max())
         self._x, self._since = x, 0
         self._steps += 1

@@ -57,6 +57,11 @@ def _errors(factors: RelativePoses, T: Array) -> tuple[Array, Array, Array]:
     return np.concatenate([baseline - factors.T_i_j[:, :3, 3], 2 * quat[:, 1:]], axis=1), quat[:, 0], baseline
 
 
+def errors(factors: RelativePoses, T: Array) -> Array:
+    """Errors e [m, 6] before whitening: meters, and twice the vector part of a quaternion."""
+    return _errors(factors, T)[0]
+
+
 def residuals(factors: RelativePoses, T: Array) -> Array:
     """Whitened residuals r [m, 6], no unit, at poses T [n, 4, 4]."""
     return (factors.whitening @ _errors(factors, T)[0][..., None])[..., 0]
