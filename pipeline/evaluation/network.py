@@ -51,6 +51,8 @@ PURPOSE = {  # of a message, by its kind
     "TREE": "poses",
     "ACK": "acknowledgements",
 }
+RUNNING_KINDS = ("STATE", *(k for k, use in PURPOSE.items() if use in ("Gaussians", "acknowledgements")))
+"""Kinds whose bytes are not set-up; messages of a solver are."""
 PURPOSES = ("Gaussians", "poses", "set-up", "acknowledgements")
 PAPER_BYTES_PER_PAIR = 2 * 28 * 4  # 28 float32 from each of the two robots
 NO_EXCHANGE = Absent("the robots exchanged nothing")
@@ -64,21 +66,37 @@ class Packets:
         round: when it was sent.
         sender: names.
         receiver: names.
-        purpose: names.
+        kind: of its message, names.
         size_bytes: header and payload.
-        delivered: or lost.
+        arrived: how often it arrived; 0 if it was lost.
+        messages: how many these packets are cut from.
     """
 
     round: NDArray[np.int64]
     sender: NDArray[np.str_]
     receiver: NDArray[np.str_]
-    purpose: NDArray[np.str_]
+    kind: NDArray[np.str_]
     size_bytes: NDArray[np.int64]
-    delivered: NDArray[np.bool_]
+    arrived: NDArray[np.int64]
     messages: int
 
     def __len__(self) -> int:
         return len(self.round)
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Which ones never arrived."""
+        return self.arrived == 0
+
+    @cached_property
+    def purpose(self) -> NDArray[np.str_]:
+        """What each is for."""
+        return np.array([PURPOSE[kind] for kind in self.kind.tolist()], dtype=np.str_)
+
+    @property
+    def setup_bytes(self) -> int:
+        """All but states of rounds, evidence and acknowledgements."""
+        return int(self.size_bytes[~np.isin(self.kind, RUNNING_KINDS)].sum())
 
 
 @dataclass(frozen=True)
@@ -129,7 +147,7 @@ class Session:
             DuagError: a packet refers to a message that the log does not have, or to an unknown kind.
         """
         kinds = {(m.robot, m.message): m.kind_name for m in self._log("exchange.mcap", topics.PEER_MESSAGE)}
-        rows = []
+        rows, used = [], set()
         for p in self._log("exchange.mcap", topics.PEER_PACKET):
             if same_robot(p.robot, p.receiver):
                 continue  # no radio carried it
@@ -140,16 +158,18 @@ class Session:
                     f"{self.run.path / 'exchange.mcap'}: packet {p.sequence} of {p.robot} is cut from {found}, "
                     f"expected one of {', '.join(PURPOSE)}"
                 )
-            rows.append((p.round, p.robot, p.receiver, PURPOSE[kind], _size(p), p.delivered))
+            used.add((p.robot, p.message))
+            arrived = 1 + len(p.copies_deliver_ns) if p.delivered else 0
+            rows.append((p.round, p.robot, p.receiver, kind, _size(p), arrived))
         columns = list(zip(*rows, strict=True)) or [()] * 6
         return Packets(
             round=np.array(columns[0], dtype=np.int64),
             sender=np.array(columns[1], dtype=np.str_),
             receiver=np.array(columns[2], dtype=np.str_),
-            purpose=np.array(columns[3], dtype=np.str_),
+            kind=np.array(columns[3], dtype=np.str_),
             size_bytes=np.array(columns[4], dtype=np.int64),
-            delivered=np.array(columns[5], dtype=np.bool_),
-            messages=len(kinds),
+            arrived=np.array(columns[5], dtype=np.int64),
+            messages=len(used),
         )
 
     @cached_property
@@ -159,7 +179,7 @@ class Session:
         out = []
         for sender, receiver in sorted(set(zip(p.sender.tolist(), p.receiver.tolist(), strict=True))):
             on = (p.sender == sender) & (p.receiver == receiver)
-            dropped = int(np.count_nonzero(on & ~p.delivered))
+            dropped = int(np.count_nonzero(on & p.lost))
             out.append(
                 Link(sender, receiver, int(np.count_nonzero(on)), dropped, int(p.size_bytes[on].sum()))
             )
@@ -230,10 +250,10 @@ class Session:
             "rounds": ticks,
             "messages": p.messages,
             "packets_sent": len(p),
-            "packets_dropped": int(np.count_nonzero(~p.delivered)),
+            "packets_dropped": int(np.count_nonzero(p.lost)),
             "bytes_sent": sent,
-            "bytes_delivered": int(p.size_bytes[p.delivered].sum()),
-            "bytes_setup": int(p.size_bytes[p.purpose == "set-up"].sum()),
+            "bytes_delivered": int((p.size_bytes * p.arrived).sum()),
+            "bytes_setup": p.setup_bytes,
             "bytes_per_round_per_robot_pair": per_pair,
             "bytes_raw_alternative": self.summary.bytes_raw_alternative,
             "bytes_raw_alternative_maps_only": self.summary.bytes_raw_alternative_maps_only,
@@ -250,7 +270,8 @@ class Session:
             "gap_to_oracle_m": gap if isinstance(gap, Absent) else gap.meters,
             "gap_to_oracle_rad": gap if isinstance(gap, Absent) else gap.radians,
         }
-        together = {m.robot for m in self.agent_rounds if len(m.members) > 1}
+        last = {m.robot: m for m in self.agent_rounds}
+        together = {robot for robot, m in last.items() if len(m.members) > 1}
         agreed: dict[str, int] = {}
         for m in self.agent_rounds:
             if m.agreed:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc import schemas
-from duagc.pipeline.base.component_names import same_robot
+from duagc.pipeline.base.component_names import robot_of, same_robot
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.messages import map_frame, pack_pose, pack_stamp
@@ -44,8 +44,8 @@ class RawAlternative:
 
     @staticmethod
     def of(data: Sequence[RobotData]) -> RawAlternative:
-        """What it takes for a team."""
-        others = len(data) - 1
+        """What it takes for a team; components of one robot count as that robot."""
+        others = len({robot_of(d.robot) for d in data}) - 1
         gaussians, factors = sum(len(d.gaussians) for d in data), sum(len(d.registrations) for d in data)
         return RawAlternative(
             others * (4 * (14 + 31) * gaussians + 40 * factors), others * (4 * 14 * gaussians + 40 * factors)
@@ -64,6 +64,7 @@ class ExchangeRecorder:
     def __init__(self, writer: LogWriter) -> None:
         self.writer = writer
         self._known: set[tuple[str, int]] = set()
+        self._on_air: set[tuple[str, int]] = set()  # of these, what a radio carried
         self._by_content: dict[bytes, tuple[str, int]] = {}
         self._totals: dict[tuple[str, str, str], list[int]] = {}  # packets, dropped, bytes, bytes delivered
 
@@ -92,6 +93,7 @@ class ExchangeRecorder:
         _write(self.writer, topics.PEER_PACKET.of(sender), message, send_ns)
         if same_robot(sender, out.receiver):
             return  # between components of one robot: no radio carries it
+        self._on_air.add((sender, out.message.id))
         totals = self._totals.setdefault((sender, out.receiver, out.message.kind.name), [0, 0, 0, 0])
         totals[0] += 1
         totals[1] += not fate.delivered
@@ -128,7 +130,7 @@ class ExchangeRecorder:
             team=team,
             rounds=rounds,
             converged=converged,
-            messages=len(self._known),
+            messages=len(self._on_air),
             bytes_raw_alternative=raw.maps_and_information,
             bytes_raw_alternative_maps_only=raw.maps_only,
         )

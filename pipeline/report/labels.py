@@ -130,7 +130,7 @@ EXCHANGE = {
     "packets_dropped": ("Packets lost", "by the simulated radio"),
     "bytes_sent": ("Bytes sent", "all attempts, headers included"),
     "bytes_delivered": ("Bytes delivered", "what arrived, headers included"),
-    "bytes_setup": ("Set-up bytes", "descriptors, samples, loop closures, relative frames, agreed poses, pair lists"),
+    "bytes_setup": ("Set-up bytes", "all but states of rounds, evidence and acknowledgements"),
     "bytes_per_round_per_robot_pair": ("Bytes per round and pair", "both directions, mean over the session"),
     "bytes_raw_alternative": ("Raw alternative", "maps with information and pose graphs to every other robot, once"),
     "bytes_raw_alternative_maps_only": ("Raw maps", "the same without the information: to look at, not to fuse"),
