@@ -25,6 +25,10 @@ _IGNORED_TAGS = {
     "PARAMS_SE3OFFSET",
 }  # start values and gauge: agents find their own
 
+MAX_TRANSLATION_M = 1e6  # as far as robots can tell each other
+WEIGHTS = (1e-18, 1e18)  # of the information and of kappa and tau
+QUATERNION_NORMS = (1e-3, 1e3)
+
 Key = tuple[str, int]
 """Robot (or "" before a graph is cut), index."""
 
@@ -61,11 +65,12 @@ def read_g2o(path: Path) -> Edges:
     """Edges of one `.g2o` file in 3-D; keys with a gtsam symbol name their robot by its character.
 
     Raises:
-        DuagError: names the line that is not understood.
+        DuagError: names the line that is not understood, or whose numbers nobody can compute with.
     """
     i: list[Key] = []
     j: list[Key] = []
     rows: list[list[float]] = []
+    lines: list[int] = []
     for number, line in enumerate(read_text(path, "a pose graph").splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#") or words[0] in _IGNORED_TAGS:
@@ -86,11 +91,36 @@ def read_g2o(path: Path) -> Edges:
         i.append(_symbol(keys[0]))
         j.append(_symbol(keys[1]))
         rows.append(row)
+        lines.append(number)
     if not rows:
         raise DuagError(f"{path}: no EDGE_SE3:QUAT in this file")
     values = np.array(rows)
-    kappa, tau = _isotropic(values[:, 7:], path)
+    upper = values[:, 7:]
+    _check_motions(path, lines, values[:, :3], values[:, 3:7])
+    _check(path, lines, "information", np.abs(upper).max(axis=1), (0.0, WEIGHTS[1]))
+    diagonal = upper[:, np.equal(*np.triu_indices(6))]
+    positive = np.where(diagonal > 0, diagonal, np.inf).min(axis=1)  # others are refused for their sign
+    _check(path, lines, "information", np.where(np.isinf(positive), 1.0, positive), WEIGHTS)
+    kappa, tau = _isotropic(upper, path)
+    _check(path, lines, "kappa", kappa, WEIGHTS)
+    _check(path, lines, "tau", tau, WEIGHTS)
     return Edges(i, j, se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3]), kappa, tau)
+
+
+def _check_motions(path: Path, lines: list[int], t: Array, quats: Array) -> None:
+    """Refuse motions that no robot can send on, and quaternions [m, 4] that hardly are any."""
+    lengths, norms = (np.hypot.reduce(v, axis=1) for v in (t, quats))  # squares might overflow
+    _check(path, lines, "translation in m", lengths, (0.0, MAX_TRANSLATION_M))
+    _check(path, lines, "quaternion norm", norms, QUATERNION_NORMS)
+
+
+def _check(path: Path, lines: list[int], topic: str, found: Array, limits: tuple[float, float]) -> None:
+    """Refuse the first line whose value is not within the limits."""
+    least, most = limits
+    outside = np.flatnonzero(~((found >= least) & (found <= most)))
+    if len(outside):
+        number, value = lines[outside[0]], found[outside[0]]
+        raise DuagError(f"{path}: line {number}: {topic} found {value:.3g}, expected {least:g} to {most:g}")
 
 
 def _symbol(key: int) -> Key:
@@ -138,6 +168,7 @@ def read_kimera(path: Path) -> Edges:
     i: list[Key] = []
     j: list[Key] = []
     rows: list[list[float]] = []
+    lines: list[int] = []
     for number, fields in enumerate(reader, start=2):
         try:
             ids = [int(fields[name]) for name in needed[:4]]
@@ -149,7 +180,11 @@ def read_kimera(path: Path) -> Edges:
         i.append((f"robot{ids[0]}", ids[1]))
         j.append((f"robot{ids[2]}", ids[3]))
         rows.append(row)
+        lines.append(number)
     if not rows:
         raise DuagError(f"{path}: no measurements in this file")
     v = np.array(rows)
+    _check_motions(path, lines, v[:, 4:7], v[:, :4])
+    _check(path, lines, "kappa", v[:, 7], WEIGHTS)
+    _check(path, lines, "tau", v[:, 8], WEIGHTS)
     return Edges(i, j, se3.from_quat_translation(v[:, [3, 0, 1, 2]], v[:, 4:7]), v[:, 7], v[:, 8])

@@ -9,9 +9,10 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.exchange.rounds import run_rounds
-from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM
+from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, MAX_TEAM
 from duagc.pipeline.network.link_model import Fate, LinkModel
 from duagc.pipeline.network.messages import Outgoing
+from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.files import TeamGraph
 from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
 
@@ -72,7 +73,7 @@ def meet(
     Returns:
         The agents, the traffic, and how many rounds there were.
     Raises:
-        DuagError: the team is too large.
+        DuagError: the team is too large, or so far apart that relative frames cannot be sent.
     """
     names = sorted(team.robots)
     if len(names) > MAX_TEAM:
@@ -81,12 +82,15 @@ def meet(
     agents = {name: PoseGraphAgent(team.robots[name], names, config) for name in built}
     settings = next(iter(agents.values())).config
     counter = _Counter(agents, watch)
-    rounds = run_rounds(
-        agents,
-        LinkModel(settings.link, config.seed),
-        counter,
-        period_ns=settings.period_ns,
-        max_rounds=settings.max_rounds,
-        title="rounds",
-    )
+    try:
+        rounds = run_rounds(
+            agents,
+            LinkModel(settings.link, config.seed),
+            counter,
+            period_ns=settings.period_ns,
+            max_rounds=settings.max_rounds,
+            title="rounds",
+        )
+    except MalformedError as error:  # what a robot decided cannot be sent
+        raise DuagError(f"pose graph: {error}; expected a team within {MAX_COORDINATE:g} m") from error
     return agents, counter.traffic, rounds

@@ -5,10 +5,14 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import LoopClosureConfig
+from duagc.pipeline.config.posegraph import settings
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.edges import read_kimera
 from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.posegraph.pose_graph import PoseGraph
 from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
+from duagc.pipeline.team_posegraph.solve import solve
 from tests.fixtures.pose_graphs import KAPPA, TAU, g2o_line, helix, helix_edges, symbol, write_g2o, write_team
 
 EXACT = LoopClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)
@@ -143,6 +147,12 @@ def test_a_graph_of_the_whole_team_in_its_folder_is_left_out(tmp_path):
 
 SE2 = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
 FINE = g2o_line(0, 1, np.eye(4))
+IDENTITY = "0.0 0.0 0.0 1.0"
+
+
+def far_line(x_m: float) -> str:
+    """An edge of such a length."""
+    return g2o_line(1, 2, se3.from_rotation_translation(np.eye(3), [x_m, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -154,6 +164,12 @@ FINE = g2o_line(0, 1, np.eye(4))
         (FINE + "EDGE_SE3:QUAT 0 2 1 2 3\n", None, ["line 2", "28"]),
         (FINE.replace(repr(TAU), "nan"), None, ["line 1", "finite"]),
         (g2o_line(0, 1, np.eye(4), tau=0.0), None, ["information", "edge 1"]),
+        (FINE + far_line(1e200), None, ["line 2: translation", "found 1e+200", "1e+06"]),
+        (FINE + far_line(2e6), None, ["line 2: translation", "found 2e+06"]),
+        (FINE.replace(IDENTITY, "0.0 0.0 0.0 1e-170"), None, ["line 1: quaternion norm", "0.001 to 1000"]),
+        (FINE.replace(IDENTITY, "7e200 0.0 0.0 7e200"), None, ["line 1: quaternion norm", "found 9.9e+200"]),
+        (FINE + g2o_line(1, 2, np.eye(4), tau=1e300), None, ["line 2: information", "found 1e+300"]),
+        (FINE + g2o_line(1, 2, np.eye(4), kappa=1e-300), None, ["line 2: information", "2e-300", "1e-18"]),
         ("EDGE_SE3_PRIOR 0 1\n", None, ["EDGE_SE3_PRIOR"]),
         ("", None, ["no EDGE_SE3:QUAT"]),
         (FINE, 2, ["cannot be cut"]),
@@ -189,3 +205,33 @@ def test_a_folder_without_graphs_is_refused(tmp_path):
         read_team_graph(plain)
     with pytest.raises(DuagError, match="no reference"):
         read_team_graph(plain / "0.g2o", 2, only_reference=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"tx": 1e200}, "translation in m found 1e+200, expected 0 to 1e+06"),
+        ({"qw": 1e-170}, "quaternion norm found"),
+        ({"kappa": 1e300}, "kappa found 1e+300, expected 1e-18 to 1e+18"),
+        ({"tau": 1e-300}, "tau found 1e-300"),
+    ],
+)
+def test_a_table_with_numbers_that_nobody_computes_with_is_refused(tmp_path, changes, words):
+    names = ["robot_src", "pose_src", "robot_dst", "pose_dst", "qx", "qy", "qz", "qw"]
+    names += ["tx", "ty", "tz", "kappa", "tau"]
+    fine = dict.fromkeys(names, 0.0) | {"pose_dst": 1, "qw": 1.0, "kappa": KAPPA, "tau": TAU}
+    rows = [fine, fine | changes]
+    path = tmp_path / "measurements.csv"
+    lines = [",".join(f"{row[n]:.0f}" if "_" in n else repr(float(row[n])) for n in names) for row in rows]
+    path.write_text("\n".join([",".join(names), *lines]))
+    with pytest.raises(DuagError) as error:
+        read_kimera(path)
+    assert f"{path}: line 3: {words}" in str(error.value)
+
+
+def test_a_team_too_far_apart_to_say_so_ends_in_one_line(tmp_path):
+    """Every edge is within the limit, and the second robot's first keyframe is not."""
+    step = se3.from_rotation_translation(np.eye(3), [9e5, 0.0, 0.0])
+    path = write_g2o(tmp_path / "far.g2o", [(k, k + 1, step) for k in range(7)])
+    with pytest.raises(DuagError, match=r"pose graph: .*expected a team within 1e\+06 m"):
+        solve(path, settings("admm", max_rounds=40), 2)
