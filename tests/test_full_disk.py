@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -18,6 +15,7 @@ from duagc.pipeline.cache.store import Store
 from duagc.pipeline.runs.digest import digest, digest_file
 from duagc.pipeline.runs.stages import FUSION
 from tests.fixtures.commands import ROOT
+from tests.fixtures.full_disks import no_file_larger_than
 from tests.fixtures.small_run import SMALL
 
 RUN = "from duagc.pipeline.cli import main; main()"
@@ -36,17 +34,6 @@ mount -o remount,size=200m "$where"
 "$@" 2>"$where/again.err" || exit 1
 cp -a "$where/run" "$where.run"
 """
-
-
-@contextmanager
-def no_file_larger_than(limit: int) -> Iterator[None]:
-    """Writing beyond this size fails as it does on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def has_room_line(err: str) -> bool:

@@ -25,6 +25,7 @@ from duagc.schemas import topics
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
+from duagc.pipeline.viewing.rrd_file import written
 from duagc.pipeline.viewing.run_rrd import APPLICATION, closed_panels, write_rrd
 
 LOG_TIME = "message_log_time"  # timeline that Rerun gives to a log
@@ -107,11 +108,8 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
             LazyChunkStream.from_iter([meter]),
         ]
     recording = rr.RecordingStream(APPLICATION, recording_id=f"recording-{out.stem}")
-    with new_file(out) as part:
-        recording.save(part, default_blueprint=_recording_blueprint(robots))
+    with written(recording, _recording_blueprint(robots), out):
         recording.send_chunks(LazyChunkStream.merge(*streams))
-        recording.flush()
-        recording.disconnect()
     return out
 
 

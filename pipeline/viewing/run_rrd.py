@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.files import new_file
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import Path3, paths
 from duagc.pipeline.evaluation.rendering import poses_by_stamp
@@ -24,6 +23,7 @@ from duagc.pipeline.report.pictures import color_by
 from duagc.pipeline.runs.folder import RobotRun, RunFolder, position_information
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import sigma_along
+from duagc.pipeline.viewing.rrd_file import written
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -52,11 +52,8 @@ def write_rrd(run_dir: Path, recording: Path, out: Path, max_gaussians: int = 30
 
     run, source = RunFolder(run_dir), Recording(recording)
     stream = rr.RecordingStream(APPLICATION, recording_id=f"run-{source.name}")
-    with new_file(out) as part:
-        stream.save(part, default_blueprint=_blueprint(run))
+    with written(stream, _blueprint(run), out):
         log_run(stream, run, source, max_gaussians)
-        stream.flush()
-        stream.disconnect()
     return out
 
 

@@ -10,6 +10,7 @@ from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.viewing import rerun_view, run_rrd
 from tests.fixtures.fake_run import FRAMES, KEYFRAMES, FakeRun, make, wall
+from tests.fixtures.full_disks import no_file_larger_than
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,18 @@ def test_a_recording_becomes_a_file_with_depth_in_meters(fake, tmp_path):
         assert "Image:buffer" not in depth
         assert found[f"/{robot}/camera/color"]["EncodedImage:blob"] == FRAMES
     assert [p.name for p in tmp_path.iterdir()] == ["recording.rrd"]
+
+
+@pytest.mark.parametrize("shown", ["run", "recording"])
+def test_a_disk_that_fills_is_one_error_and_leaves_nothing(fake, tmp_path, shown):
+    out, logs = tmp_path / "shown.rrd", [fake.recording / "alpha.mcap"]
+    write = {
+        "run": lambda: run_rrd.write_rrd(fake.run, fake.recording, out),
+        "recording": lambda: rerun_view.recording_to_rrd(logs, out),
+    }[shown]
+    with no_file_larger_than(1 << 14), pytest.raises(DuagError, match=r"shown.rrd: .*expected to write a"):
+        write()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
