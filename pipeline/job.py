@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from duagc import __version__
-from duagc.pipeline import steps
+from duagc.pipeline import preparation, steps
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Step
@@ -142,7 +141,7 @@ class Job:
         cameras, lines = carried.entry.result["cameras"], carried.entry.result["lines"]
         for line in lines if not self.carrier.looking else ():
             self.log(line)
-        of = os.path.relpath(self.recording.path, self.folder)
+        of = preparation.way(self.folder, self.recording.path)
         self._calibration = {"calibration": {"of": of, "cameras": cameras}}
         self._before = [carried]
         if carried.entry.files:
@@ -371,7 +370,7 @@ class Job:
             "schema": SCHEMA,
             "duagc": __version__,
             "libraries": {name: version(name) for name in LIBRARIES},
-            "recording": os.path.relpath(self.recording.path, self.folder),
+            "recording": preparation.way(self.folder, self.recording.path),
             "config": digest_file(self.folder / "config.toml"),
             "inputs": {robot: self._digest(self.recording.log(robot)) for robot in self.recording.robots},
             "outputs": {n: digest for n, digest in files.items() if Path(n).suffix in RESULT_SUFFIXES},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -36,6 +37,16 @@ Say = Callable[[str], None]
 def say(line: str) -> None:
     """Say something on standard error."""
     print(line, file=sys.stderr, flush=True)
+
+
+def way(folder: Path, path: Path) -> str:
+    """The relative path from one place to another, by the folders that symbolic links lead to.
+
+    Args:
+        folder: where it begins; "..", of a folder that is reached by a link, is not the folder of the link.
+        path: where it ends.
+    """
+    return os.path.relpath(os.path.realpath(path), os.path.realpath(folder))
 
 
 def stages_of(run: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.preparation import way
 from duagc.pipeline.replay import replay
 from duagc.pipeline.report import write_report
 from duagc.pipeline.runs.folder import RunFolder
@@ -77,3 +78,16 @@ def test_a_run_that_is_not_there_says_so(tmp_path: Path) -> None:
         DuagError, match=r"manifest.json: no such file, expected the manifest of a finished run"
     ):
         _ = RunFolder(tmp_path / "nowhere").recording
+
+
+def test_a_run_below_a_link_to_another_disk_finds_its_recording(tmp_path: Path) -> None:
+    recording, disk = tmp_path / "project" / "recordings" / "room", tmp_path / "disk" / "deep" / "outputs"
+    recording.mkdir(parents=True)
+    disk.mkdir(parents=True)
+    outputs = tmp_path / "project" / "outputs"
+    outputs.symlink_to(disk)
+    (outputs / "run").mkdir()
+    named = {"schema": 1, "recording": way(outputs / "run", recording)}
+    (outputs / "run" / "manifest.json").write_text(json.dumps(named))
+    for folder in (outputs, disk):
+        assert RunFolder(folder / "run").recording == recording.resolve()
