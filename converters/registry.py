@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from duagc.pipeline.base.atomic_folder import check_apart
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.config.base import value_of
 
@@ -82,6 +83,8 @@ def convert(
     Raises:
         DuagError: names the file, what was found and what was expected.
     """
+    files = [Path(mask.partition("=")[2] or mask) for mask in masks]
+    check_apart(Path(out), [Path(src), *files, *([options_file] if options_file else [])])
     module = _module(dataset)
     count = {} if robots is None else {"robots": robots}
     said = parse_options(options)

@@ -14,7 +14,7 @@ from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
 from duagc.pipeline.base import determinism
-from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.packages import check_packages
 from duagc.pipeline.config.run import RunConfig
@@ -65,6 +65,7 @@ def run(
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
     check_packages(config)
+    check_apart(out, [recording_path] if store is None else [recording_path, store])
     plan = RunPlan(
         workers, force, calibrate, store=store, since=since, until=until, evaluated=evaluated, follow=follow
     )

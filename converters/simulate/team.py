@@ -15,13 +15,14 @@ from duagc.converters.simulate.sensors import light, shutter
 from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
 from duagc.converters.simulate.sensors.lens import Lens
 from duagc.converters.simulate.sensors.rig import RANGE_SIGMA_M, T_CAMERA_LIDAR, Rig
-from duagc.converters.simulate.settings import Cover, SimulationSettings, camera_of, scene_of
+from duagc.converters.simulate.settings import SCENES, Cover, SimulationSettings, camera_of, scene_of
 from duagc.converters.simulate.simulated_scenes import SimulatedMeshes, SimulatedScene, set_up
 from duagc.converters.simulate.trajectories import loops, paradigms
 from duagc.converters.simulate.trajectories.moments import pose_at, twists_of
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.atomic_folder import check_apart
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -104,6 +105,8 @@ def simulate(
         triangles=triangles,
     )
     settings.check()
+    if scene not in SCENES:
+        check_apart(out, [Path(scene)])
     _check_output(out, workers, preview)
     _check_paths(settings, paths)
     determinism.configure_determinism()

@@ -3,13 +3,14 @@
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from duagc.pipeline.base.errors import DuagError
 
-RUN = "a run", ("manifest.json", "run/manifest.json")  # the latter of a demo
+RUN = "a run", ("manifest.json",)
+DEMO = "a run", ("manifest.json", "run/manifest.json")
 RECORDING = "a recording", ("recording.json",)
 
 
@@ -17,9 +18,12 @@ RECORDING = "a recording", ("recording.json",)
 def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) -> Iterator[Path]:
     """A folder next to `out` that takes its name when the block ends well, and is removed when it does not.
 
-    force: replace what is there, if it is empty or of this kind: its name, and the files that mark it.
+    force: replace what is there, if it is empty or of this kind: its name, and the files that mark it. A symbolic link
+        stays, and the folder that it names is replaced.
     """
     _check_out(out, force, kind)
+    if out.is_symlink():
+        out = out.resolve()  # renaming would move the link
     partial, replaced = (out.with_name(out.name + ending) for ending in (".part", ".replaced.part"))
     with _locked(partial):
         try:
@@ -34,6 +38,22 @@ def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) 
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
+
+
+def check_apart(out: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a folder to write that is an input or holds one: replacing the folder would delete it.
+
+    Args:
+        out: the folder.
+        inputs: files and folders that are read, or kept.
+
+    Raises:
+        DuagError: names the input.
+    """
+    place = out.resolve()
+    for path in inputs:
+        if path.resolve().is_relative_to(place):
+            raise DuagError(f"{out}: found {path} in it, expected --out apart from what is read or kept")
 
 
 def _settle(replaced: Path, out: Path) -> None:
@@ -77,6 +97,8 @@ def _check_out(out: Path, force: bool, kind: tuple[str, tuple[str, ...]]) -> Non
     """Refuse to replace what is there, unless `force` and nothing of another kind would be lost."""
     if not out.name:
         raise DuagError(f"{out}: found a path without a name, expected the name of a new folder")
+    if out.is_symlink() and not out.exists():
+        raise DuagError(f"{out}: is a symbolic link to nothing, expected a folder or a new name")
     if not out.exists():
         return
     if not force:

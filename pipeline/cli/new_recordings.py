@@ -227,6 +227,7 @@ def convert(
     `duagc convert ros campus.bag --mask alpha=bumper.png --out recordings/campus`
     """
     from duagc.converters import registry
+    from duagc.pipeline.base.atomic_folder import check_apart
 
     if list_datasets:
         print(registry.describe())
@@ -248,6 +249,7 @@ def convert(
         )
 
     if calibrate:
+        check_apart(out, [source])
         _convert_calibrated(convert_to, out, force)
     else:
         convert_to(out, force)

@@ -34,12 +34,12 @@ def demo(
     Example: `duagc demo --out outputs/demo`
     """
     from duagc.converters.simulate.team import simulate as simulate_recording
-    from duagc.pipeline.base.atomic_folder import new_folder
+    from duagc.pipeline.base.atomic_folder import DEMO, new_folder
     from duagc.pipeline.cache.store import default_store
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.runner import run as run_stages
 
-    with new_folder(out, force) as folder:
+    with new_folder(out, force, DEMO) as folder:
         say(f"simulate: {robots} robots, {frames} frames each")
         simulate_recording(folder / "recording", robots=robots, frames=frames, seed=seed, workers=workers)
         run_stages(

@@ -21,7 +21,7 @@ from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.summary import Summary
 
-from duagc.pipeline.base.atomic_folder import RECORDING, new_folder
+from duagc.pipeline.base.atomic_folder import RECORDING, check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, read_bytes
 from duagc.pipeline.base.progress import track
@@ -46,6 +46,7 @@ def recover(source: Path, out: Path, force: bool = False) -> list[Salvage]:
     if not source.is_dir():
         check_file(source, "a log or a recording")
     else:
+        check_apart(out, [source])
         with new_folder(out, force, RECORDING) as folder:
             return _recover_recording(source, folder, out.resolve().name)
     if out.exists() and not force:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from duagc.pipeline.base.open3d_import import import_open3d
@@ -65,6 +65,7 @@ def export(run_folder: Path, out: Path, plan: ExportPlan, *, force: bool = False
     """
     if plan.tile_m is not None and not SMALLEST_TILE_M <= plan.tile_m < np.inf:
         raise DuagError(f"--tile: found {plan.tile_m:g}, expected {SMALLEST_TILE_M:g} m or more")
+    check_apart(out, [run_folder])
     run = RunFolder(run_folder)
     names = tuple(dict.fromkeys(plan.robots)) or tuple(run.robots)
     for name in names:

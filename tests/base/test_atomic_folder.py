@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from duagc.pipeline.base import atomic_folder
-from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
 
 
@@ -55,3 +55,34 @@ def test_what_is_stopped_between_two_names_gives_the_old_one_back(tmp_path: Path
     assert content(tmp_path / "run") == {"manifest.json": "old", "fused.mcap": "old"}
     shutil.rmtree(tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_stays_and_what_it_names_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    write(tmp_path / "disk" / "run", "old")
+    (tmp_path / "run").symlink_to(tmp_path / "disk" / "run")
+    for text in ("new", "newer"):
+        write(tmp_path / "run", text)
+        assert (tmp_path / "run").is_symlink()
+        assert content(tmp_path / "disk" / "run") == {"manifest.json": text, "fused.mcap": text}
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "run"]
+        assert [path.name for path in (tmp_path / "disk").iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_a_link_to_nothing_is_refused_before_the_work(tmp_path: Path, force: bool) -> None:
+    (tmp_path / "run").symlink_to(tmp_path / "absent" / "run")
+    with pytest.raises(DuagError, match="symbolic link to nothing"), new_folder(tmp_path / "run", force):
+        pytest.fail("began")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_output_that_holds_an_input_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run" / "recording").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "run")
+    (tmp_path / "input").symlink_to(tmp_path / "run" / "recording")
+    for out in ("run", "link"):
+        for path in ("run", "run/recording", "link/recording", "input", "run/store-to-come"):
+            with pytest.raises(DuagError, match="expected --out apart"):
+                check_apart(tmp_path / out, [tmp_path, tmp_path / path])
+    check_apart(tmp_path / "run", [tmp_path, tmp_path / "runs" / "recording"])
