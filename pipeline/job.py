@@ -77,6 +77,7 @@ class Job:
             folder, config, plan, log=log, place=place, looking=looking, begun=self._announce
         )
         self.store = self.carrier.store
+        self._versions = {} if self.store is None else preparation.versions(self.store)
         self.digests = FileDigests(None) if self.store is None else self.store.files
         self.missing: list[StageKey] = []
         self._calibration: dict[str, Any] = {}
@@ -266,9 +267,8 @@ class Job:
         return found, absent
 
     def _processes(self) -> RobotProcesses:
-        return RobotProcesses(
-            self.recording.path, self.folder, self.config, self.plan, self._place, self._where
-        )
+        of = self.recording.path, self.folder, self.config, self.plan, self._place, self._where
+        return RobotProcesses(*of, self._versions)
 
     def _prepared(self, chain: Chain) -> dict[str, Prepared]:
         """Every robot with its own results, by name; `workers` at a time in processes of their own."""

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from duagc.pipeline.base.machine import memory_bytes
 from duagc.pipeline.base.thread_share import SharedThreads, ThreadShare, keep_share
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.cache.carrier import Carried, Carrier
+from duagc.pipeline.cache.code_identity import CodeVersion
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.footprint import fitting, robot_bytes
 from duagc.pipeline.cache.stage_key import StageKey
@@ -61,6 +62,17 @@ def stages_of(run: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     return rows if isinstance(rows, dict) else {}
+
+
+def versions(store: Store) -> dict[str, CodeVersion]:
+    """Versions of the code of all stages, by entry, read now: results of code that is edited later are not kept.
+
+    Args:
+        store: of the run, which remembers them.
+    """
+    for stage in (stages.CALIBRATION, *stages.STAGES):
+        store.code.version_of(stage.code)
+    return store.code.versions
 
 
 def carrier_of(
@@ -155,6 +167,7 @@ class RobotProcesses:
         plan: how it is done.
         place: where an earlier run may be.
         where: of the server that shows the run; None: nobody follows.
+        versions: of the code of the stages, by entry, as the run began with them.
     """
 
     recording: Path
@@ -163,6 +176,7 @@ class RobotProcesses:
     plan: RunPlan
     place: Path
     where: Any = None
+    versions: Mapping[str, CodeVersion] = field(default_factory=dict)
 
     def prepare(
         self, robots: Sequence[str], workers: int, *, alone: bool, hear: worker_reports.Hear
@@ -257,6 +271,8 @@ class RobotProcesses:
 
         carrier = carrier_of(self.folder, self.config, self.plan, log=log, place=self.place)
         digests = FileDigests(None) if carrier.store is None else carrier.store.files
+        if carrier.store is not None:
+            carrier.store.code.adopt(dict(self.versions))
         return Chain(Recording(self.recording), carrier, digests, heard)
 
 

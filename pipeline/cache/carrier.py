@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +16,9 @@ from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs.declared_settings import DeclaredSettings
 from duagc.pipeline.runs.stages import Stage
 from duagc.pipeline.runs.timing import Timing, label
+
+CHANGED = "source that changed meanwhile"
+"""Stands among the modules of a key where nobody knows what code the results are of: no other key is like it."""
 
 
 class NotStoredError(Exception):
@@ -141,7 +144,11 @@ class Carrier:
             if key.stage in self.again:
                 self.store.forget_checkpoints(key)
             entry = self._compute(key, stage, compute, files)
-            if self._keep(entry):
+            if self.store.code.has_changed(stage.code):
+                self.say(f"warning: {words(key)}: its source changed while it was computed; not kept")
+                entry = replace(entry, key=replace(key, code={**key.code, CHANGED: "unknown"}))
+                self.store.forget_checkpoints(key)
+            elif self._keep(entry):
                 self.store.forget_checkpoints(key)
             return Carried(entry, True)
 

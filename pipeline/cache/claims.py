@@ -80,9 +80,14 @@ def claim(folder: Path, done: Callable[[], bool], waiting: Callable[[], None]) -
     while True:
         try:
             folder.mkdir()
-            return Claim(folder)
         except FileExistsError:
             pass
+        else:
+            try:
+                return Claim(folder)
+            except OSError:  # without its owner others would wait for it until it counts as dead
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
         if done():
             return None
         if watch.is_dead():

@@ -90,6 +90,30 @@ class CodeReader:
             self._versions[entry] = self._version_of(entry)
         return self._versions[entry]
 
+    @property
+    def versions(self) -> dict[str, CodeVersion]:
+        """What was asked for until now, by entry."""
+        return dict(self._versions)
+
+    def adopt(self, versions: dict[str, CodeVersion]) -> None:
+        """Take versions over that another process of the same run has read, whatever the files are by now.
+
+        Args:
+            versions: by entry.
+        """
+        self._versions |= versions
+
+    def has_changed(self, entry: str) -> bool:
+        """Whether files are other than when the version of a function was read.
+
+        Args:
+            entry: `module:function`, which was asked for before.
+        """
+        try:
+            return CodeReader(self._known, self.root).version_of(entry) != self._versions[entry]
+        except (DuagError, OSError):  # somebody edits it now
+            return True
+
     def _version_of(self, entry: str) -> CodeVersion:
         module, _, function = entry.partition(":")
         path = self._path_of(module)

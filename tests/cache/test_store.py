@@ -12,15 +12,19 @@ from pathlib import Path
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cache import claims
 from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError
+from duagc.pipeline.cache.code_identity import CodeReader
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.garbage import LEFTOVER_NS, collect
+from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store, default_store
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs.stages import Stage
 from duagc.pipeline.runs.timing import Timing
 from tests.fixtures.commands import ROOT, assert_one_line, duagc_here
+from tests.fixtures.full_disks import no_file_larger_than
 
 STAGE = Stage(
     "sum",
@@ -131,6 +135,45 @@ def test_a_damaged_entry_is_named_and_computed_again(bench: Bench, damage: Calla
     assert bench.carry().executed
     assert [line for line in bench.said if f"{path.name}: is damaged" in line] == bench.said != []
     assert not bench.carry().executed
+
+
+def test_results_of_code_that_is_edited_meanwhile_are_not_kept(bench: Bench) -> None:
+    source = bench.folder / "package" / "pipeline" / "base" / "errors.py"
+    source.parent.mkdir(parents=True)
+    source.write_text("def closest():\n    return 1\n")
+
+    def edit(key: StageKey, stored: bool) -> None:
+        bench.store.checkpoints(key).mkdir(parents=True)
+        source.write_text("def closest():\n    return 2\n")
+
+    bench.store.code = CodeReader(root=bench.folder / "package")
+    edited = bench.carry(begun=edit).entry
+    assert bench.said == ["warning: sum: its source changed while it was computed; not kept"]
+    assert bench.store.recent("sum", 10) == []
+    assert list((bench.folder / "store" / "checkpoints").iterdir()) == []
+    earlier = {"sum": edited.plain() | {"key": edited.key.digest}}
+    for _ in range(2):  # a process that began with the old code, and one that begins now
+        assert bench.carry(earlier=earlier, place=bench.folder / "run1").executed
+        bench.store.code = CodeReader(root=bench.folder / "package")
+    assert not bench.carry().executed
+
+
+def test_a_run_goes_on_with_the_versions_that_it_began_with(bench: Bench) -> None:
+    began = bench.store.code.version_of(STAGE.code)
+    later = CodeReader(root=bench.folder)
+    later.adopt(bench.store.code.versions)
+    assert later.version_of(STAGE.code) == began
+    assert later.has_changed(STAGE.code)
+    assert not bench.store.code.has_changed(STAGE.code)
+
+
+def test_a_claim_that_cannot_name_its_owner_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(claims, "this_process", lambda: {"host": "x" * 100_000})
+    with no_file_larger_than(1000), pytest.raises(OSError, match="File too large"):
+        claims.claim(tmp_path / "claim", lambda: False, lambda: None)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_earlier_run_serves_where_the_store_forgot(bench: Bench) -> None:
