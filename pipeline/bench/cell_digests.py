@@ -3,21 +3,39 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable
 from pathlib import Path
 
 from duagc.converters.simulate.render import mesh_process, meshes
 from duagc.converters.simulate.scenes.catalog import SCENES
+from duagc.pipeline.cache.code_identity import PYTHON, library_version
+
+LIBRARIES = (
+    "cryptography",
+    "cv2",
+    "google",
+    "mcap",
+    "numpy",
+    "open3d",
+    "pyarrow",
+    "pydantic",
+    "scipy",
+    "small_gicp",
+    "torch",
+)
+"""Modules of libraries that the simulator and the stages up to the evaluation import."""
 
 
 def code_digest() -> str:
-    """Digest of all code that a cell runs through."""
-    from duagc import converters, pipeline
+    """Digest of all code that a cell runs through, and of the versions of the libraries that it imports."""
+    from duagc import converters, pipeline, schemas
 
-    digest = hashlib.sha256()
-    for package in (converters, pipeline):
+    versions = {"python": PYTHON} | {name: library_version(name) for name in LIBRARIES}
+    digest = hashlib.sha256(json.dumps(versions).encode())
+    for package in (converters, pipeline, schemas):
         root = Path(next(iter(package.__path__)))
-        for path in _files(root, (".py", ".so")):
+        for path in _files(root, (".py", ".so", ".binpb")):
             digest.update(f"{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes())
     return digest.hexdigest()
 

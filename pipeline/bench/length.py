@@ -15,6 +15,7 @@ from typing import Any
 
 from duagc.pipeline.base.component_names import submap_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
 from duagc.pipeline.base.machine import processors
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.bench.tables import markdown
@@ -92,10 +93,11 @@ def _row(plan: LengthPlan, source: Recording, seconds: float, folder: Path) -> d
         folder: where the part of the recording and the run go.
 
     Raises:
-        DuagError: a part of another recording is there.
+        DuagError: a part of another recording is there, or a run that was made otherwise.
     """
     path, out = folder / f"recording{seconds:g}", folder / f"run{seconds:g}"
     part = _part(source, seconds, path)
+    _check_made_so(plan, out)
     begun = out.exists() or out.with_name(f"{out.name}.part").exists()
     done = execute(THIS, part.path, out, processors=plan.threads, options=plan.options)
     front = [row for row in done.stages.values() if row["stage"] == "frontend"]
@@ -122,6 +124,20 @@ def _row(plan: LengthPlan, source: Recording, seconds: float, folder: Path) -> d
     }
 
 
+def _check_made_so(plan: LengthPlan, out: Path) -> None:
+    """Note how a run is made before it is; one that is there was made so."""
+    stays = out.with_name(f"{out.name}.made.json")
+    made = {"threads": plan.threads, "options": list(plan.options)}
+    if out.exists() or out.with_name(f"{out.name}.part").exists():
+        found = json.loads(stays.read_text(encoding="utf-8")) if stays.is_file() else "nothing that is known"
+        if found != made:
+            raise DuagError(f"{out}: was made with {found}, expected {made}; choose another --keep")
+        return
+    stays.parent.mkdir(parents=True, exist_ok=True)
+    with new_file(stays) as unfinished:
+        unfinished.write_text(json.dumps(made), encoding="utf-8")
+
+
 def _part(source: Recording, seconds: float, path: Path) -> Recording:
     """The recording that its logs begin with; taken from where it stays, if it is of this recording."""
     stays = path.with_name(f"{path.name}.of.json")
@@ -135,7 +151,8 @@ def _part(source: Recording, seconds: float, path: Path) -> Recording:
         return Recording(path)
     shutil.rmtree(path, ignore_errors=True)  # a part that was not finished
     path.parent.mkdir(parents=True, exist_ok=True)
-    stays.write_text(json.dumps(of), encoding="utf-8")
+    with new_file(stays) as unfinished:
+        unfinished.write_text(json.dumps(of), encoding="utf-8")
     return part_of(source, len(source.robots), seconds, path)
 
 

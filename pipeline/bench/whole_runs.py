@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
 from duagc.pipeline.recording import RECORDING_FILE, LogWriter, Recording
 from duagc.pipeline.recording.read import LogFile, log_metadata
 from duagc.schemas import topics
@@ -125,7 +126,8 @@ def part_of(recording: Recording, robots: int, until_s: float | None, folder: Pa
             row["end_ns"] = min(row["end_ns"], row["start_ns"] + round(until_s / SECOND))
             with LogFile(folder / row["log"]) as log:
                 row["frames"] = sum(1 for _ in log.records([topics.COLOR.of(name)]))
-    (folder / RECORDING_FILE).write_text(json.dumps(description, indent=2))
+    with new_file(folder / RECORDING_FILE) as part:
+        part.write_text(json.dumps(description, indent=2))
     return Recording(folder)
 
 

@@ -14,6 +14,7 @@ import sys
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.machinery import EXTENSION_SUFFIXES
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ class CodeReader:
                 else:
                     digests[self._label(found)] = _digest(found.read_bytes())
         self._save()
-        versions = {name: version for name in sorted(libraries) if (version := _version(name))}
+        versions = {name: version for name in sorted(libraries) if (version := library_version(name))}
         return CodeVersion(dict(sorted(digests.items())), {"python": PYTHON} | versions)
 
     def _label(self, path: Path) -> str:
@@ -249,9 +250,16 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _version(library: str) -> str:
-    """Version of an installed library; "" if it is not installed."""
+def library_version(library: str) -> str:
+    """Version of an installed library; "" if it is not installed.
+
+    Args:
+        library: name of its module. It may be of another distribution than is usual, which then is named, or of none.
+    """
     try:
         return metadata.version(DISTRIBUTIONS.get(library, library))
     except metadata.PackageNotFoundError:
-        return ""
+        if find_spec(library) is None:
+            return ""
+    names = sorted(set(metadata.packages_distributions().get(library, ())))
+    return ", ".join(f"{name} {metadata.version(name)}" for name in names) or "unknown"

@@ -16,6 +16,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.bench import length, realtime, whole_runs
 from duagc.pipeline.cli import app
 from duagc.pipeline.recording import Recording, content_digest, open_rgbd
+from tests.fixtures.full_disks import no_file_larger_than
 
 COMMAND = """#!{python}
 import json, os, sys
@@ -138,7 +139,19 @@ def test_what_is_kept_is_completed(
     assert length.run(plan)["rows"][0]["wall_s"] > 0
     plan = length.LengthPlan(recording.path, (0.1, 0.2), threads=1, keep=tmp_path / "kept")
     assert [row["wall_s"] is None for row in length.run(plan)["rows"]] == [True, False]
-    assert sorted(path.name for path in (tmp_path / "kept").glob("run*")) == ["run0.1", "run0.2"]
+    runs = [path.name for path in (tmp_path / "kept").glob("run*") if path.is_dir()]
+    assert sorted(runs) == ["run0.1", "run0.2"]
+    for other in (replace(plan, threads=2), replace(plan, options=("--set", "seed=1"))):
+        with pytest.raises(DuagError, match=r"run0\.1: was made with .*choose another --keep"):
+            length.run(other)
+
+
+def test_a_part_has_its_description_when_it_is_whole(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with no_file_larger_than(100), pytest.raises(DuagError, match="File too large"):
+        whole_runs.part_of(recording, 1, None, tmp_path / "part")
+    assert not (tmp_path / "part" / "recording.json").exists()
 
 
 @pytest.mark.parametrize("stated", [True, False], ids=["digests", "no digests"])

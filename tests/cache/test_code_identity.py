@@ -1,11 +1,14 @@
 """The version of a stage's code changes with what it computes by, and with nothing else."""
 
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.cache.code_identity import CodeReader
+from duagc.pipeline.bench import cell_digests
+from duagc.pipeline.cache.code_identity import DISTRIBUTIONS, CodeReader, library_version
+from duagc.pipeline.experiments.carry_out import SIMULATOR
 from duagc.pipeline.runs import stages
 
 ENTRY = "duagc.steps:track"
@@ -132,4 +135,20 @@ def test_every_stage_counts_its_own_folder_and_the_compiled_kernels() -> None:
 
 
 def test_results_depend_on_the_version_of_open3d_where_it_is_used() -> None:
-    assert "open3d" in CodeReader().version_of("duagc.pipeline.steps:frontend").libraries
+    reader = CodeReader()
+    assert "open3d" in reader.version_of("duagc.pipeline.steps:frontend").libraries
+    until = 1 + stages.STAGES.index(stages.EVALUATION)
+    entries = [SIMULATOR, *(stage.code for stage in stages.STAGES[:until])]
+    used = {name for entry in entries for name in reader.version_of(entry).libraries}
+    assert used - {"python"} <= set(cell_digests.LIBRARIES)
+
+
+def test_a_library_of_another_distribution_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert library_version("numpy") == metadata.version("numpy")
+    assert library_version("cv2") == metadata.version("opencv-python-headless")
+    monkeypatch.setitem(DISTRIBUTIONS, "cv2", "opencv-of-nobody")
+    assert library_version("cv2") == f"opencv-python-headless {metadata.version('opencv-python-headless')}"
+    assert library_version("no_such_library") == ""
+    (tmp_path / "copied_library.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert library_version("copied_library") == "unknown"
