@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from duagc.pipeline.batch.cell import CellState, read_state, write_state
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.batch.cell import CELLS, CellState, read_state, write_state
 from duagc.pipeline.batch.engines import Engine
 from duagc.pipeline.batch.suite import Suite
 
@@ -28,7 +31,31 @@ def run_batch(
 
     Returns:
         What became of each, by name.
+
+    Raises:
+        DuagError: another process runs a batch there.
     """
+    with _alone(out):
+        return _run(suite, out, store, engine, log=log)
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Be the one process that runs a batch in a folder; the kernel gives the lock up with the process."""
+    (out / CELLS).mkdir(parents=True, exist_ok=True)
+    with (out / CELLS / ".lock").open("ab") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise DuagError(
+                f"{out}: another process runs a batch there; wait, or choose another --out"
+            ) from error
+        yield
+
+
+def _run(
+    suite: Suite, out: Path, store: Path, engine: Engine, *, log: Callable[[str], None]
+) -> Mapping[str, CellState]:
     for name in suite.cells:
         write_state(out, name, CellState())
     waiting, running = list(suite.cells), set[str]()

@@ -134,6 +134,21 @@ def test_a_failed_cell_is_tried_again_once_and_stops_no_other(suite: Suite, tmp_
     assert text[-1] == "3 done, 1 failed"
 
 
+def test_two_batches_do_not_run_in_one_folder(suite: Suite, tmp_path: Path) -> None:
+    refused = list[str]()
+
+    class Second(Pretended):
+        def submit(self, name: str, arguments: Mapping[str, str]) -> None:
+            with pytest.raises(DuagError, match="another process runs a batch there") as error:
+                run_batch(suite, tmp_path, tmp_path / "store", Pretended(tmp_path, {}), log=print)
+            refused.append(str(error.value))
+            super().submit(name, arguments)
+
+    for _ in range(2):  # the lock goes with the batch
+        run_batch(suite, tmp_path, tmp_path / "store", Second(tmp_path, {}), log=print)
+    assert len(refused) == 2 * len(suite.cells)
+
+
 def test_a_cell_whose_process_dies_has_failed(suite: Suite, tmp_path: Path) -> None:
     name = "wall-plain-0"
     killed = replace(suite, cells={"killed": suite.cells[name]})
