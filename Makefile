@@ -14,6 +14,13 @@ SANITIZED := build/sanitize/.built
 DEMO := outputs/demo
 DOCS_VENV := build/docs-venv
 
+# Commands of a recipe that needs a Python with venv.
+define CHECK_PYTHON
+@command -v $(PYTHON) >/dev/null || { echo "setup: $(PYTHON) not found; install Python 3.11 or later" >&2; exit 1; }
+@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "setup: $$($(PYTHON) --version) found, Python 3.11 or later expected; set PYTHON=" >&2; exit 1; }
+@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "setup: Python module venv not found; on Debian: apt-get install python3-venv" >&2; exit 1; }
+endef
+
 .PHONY: help setup demo test golden docs bench lint format sanitize check-full fuzz clean
 .DEFAULT_GOAL := help
 
@@ -30,12 +37,10 @@ help:
 setup: $(STAMP)
 
 $(STAMP): $(SOURCES)
-	@command -v $(PYTHON) >/dev/null || { echo "setup: $(PYTHON) not found; install Python 3.11 or later" >&2; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "setup: $$($(PYTHON) --version) found, Python 3.11 or later expected; set PYTHON=" >&2; exit 1; }
-	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "setup: Python module venv not found; on Debian: apt-get install python3-venv" >&2; exit 1; }
+	$(CHECK_PYTHON)
 	@command -v c++ >/dev/null || { echo "setup: no C++ compiler found; on Debian: apt-get install g++" >&2; exit 1; }
 	@$(PYTHON) -c 'import os, sys, sysconfig; sys.exit(not os.path.exists(os.path.join(sysconfig.get_paths()["include"], "Python.h")))' || { echo "setup: Python.h not found; on Debian: apt-get install python3-dev" >&2; exit 1; }
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH_OPTIONS) "torch==2.13.0"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test,lint,dev]"
 	touch $(STAMP)
@@ -56,7 +61,8 @@ docs: $(DOCS_VENV)/.set-up
 	NO_MKDOCS_2_WARNING=1 $(DOCS_VENV)/bin/mkdocs build --strict
 
 $(DOCS_VENV)/.set-up: pyproject.toml
-	test -x $(DOCS_VENV)/bin/python || $(PYTHON) -m venv $(DOCS_VENV)
+	$(CHECK_PYTHON)
+	$(DOCS_VENV)/bin/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(DOCS_VENV)
 	$(DOCS_VENV)/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' > $(DOCS_VENV)/requirements.txt
 	$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -r $(DOCS_VENV)/requirements.txt
 	touch $@
