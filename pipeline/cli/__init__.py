@@ -2,6 +2,7 @@
 
 import errno
 import sys
+from io import TextIOWrapper
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
@@ -48,6 +49,9 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's shar
 def main() -> None:
     """Entry point: one line and exit code 1 for whatever a user can fix."""
     determinism.configure_determinism()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")  # a terminal may lack a letter of a name
     try:
         app()
     except DuagError as error:

@@ -179,9 +179,12 @@ def _bytes(option: str, text: str) -> int:
     number, unit = text[:-1], text[-1:]
     factor = {"k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}.get(unit)
     try:
-        return int(float(number) * factor) if factor else int(text)
-    except (ValueError, OverflowError) as error:
-        raise typer.BadParameter(f"{text!r} is not a size such as 20G", param_hint=option) from error
+        size = int(float(number) * factor) if factor else int(text)
+    except (ValueError, OverflowError):
+        size = -1
+    if size < 0:
+        raise typer.BadParameter(f"{text!r} is not a size such as 20G", param_hint=option)
+    return size
 
 
 def _say_times(run_folder: Path) -> None:

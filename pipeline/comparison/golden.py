@@ -67,9 +67,13 @@ def _read(golden: Path) -> tuple[RunSummary, dict[str, object]]:
                 for file, of_file in content["topics"].items()
                 for topic, stored in of_file.items()
             }
-        metrics = content["metrics"]
-        return RunSummary(content["digest"], content["files"], topics, content.get("metadata", {})), metrics
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        metrics, metadata = content["metrics"], content.get("metadata", {})
+        tables = [content["files"], metrics, metadata, *metadata.values()]
+        tables += [topic.fields for topic in topics.values()]
+        if not all(isinstance(table, dict) for table in tables):
+            raise TypeError("found a list or a value in place of a table")
+        return RunSummary(content["digest"], content["files"], topics, metadata), metrics
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise DuagError(f"{golden}: {error}, expected a golden run (.json and .npz)") from error
 
 

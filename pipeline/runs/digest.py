@@ -1,9 +1,11 @@
 """Digests of results: what a run computed, whatever the file encoders, clocks and folders around it."""
 
 import hashlib
+import json
 from pathlib import Path
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
 from duagc.pipeline.recording import Recording, content_digest
 
 RESULT_SUFFIXES = (".mcap", ".ply", ".tum")
@@ -63,6 +65,17 @@ def digest(path: Path) -> str:
     return whole.hexdigest()
 
 
+def _named_outputs(manifest: Path) -> list[str]:
+    """Results that a manifest names; none if there is no manifest."""
+    if not manifest.is_file():
+        return []
+    try:
+        outputs = json.loads(read_text(manifest, "the manifest of a run")).get("outputs", {})
+        return sorted(outputs.keys())
+    except (ValueError, AttributeError) as error:
+        raise DuagError(f"{manifest}: is damaged ({error}), expected the manifest of a run") from error
+
+
 def _check_complete(run: Path) -> None:
     """An unfinished or damaged run has no digest: it would equal nothing and say nothing."""
     folders = sorted(p for p in (run / "robots").iterdir() if p.is_dir())
@@ -70,6 +83,7 @@ def _check_complete(run: Path) -> None:
         raise DuagError(f"{run}: found no folder robots/<robot>, expected a run")
     wanted = [run / name for name in TEAM_RESULTS]
     wanted += [folder / name for folder in folders for name in ROBOT_RESULTS]
+    wanted += [run / name for name in _named_outputs(run / "manifest.json")]
     for path in wanted:
         if not path.is_file():
             raise DuagError(f"{path}: not found, expected every result of a finished run")

@@ -42,6 +42,10 @@ TYPES = {
     "calibration": dict,
 }
 """What the manifest holds."""
+TABLES = ("robots", "team", "rendering", "calibration", "exchange", "consensus", "protocol", "reasons")
+"""What metrics.json holds."""
+TIMES = ("wall_s", "cpu_s", "peak_rss_mb")
+"""What timing.json holds of every stage."""
 METRICS_SCHEMA = 2  # of metrics.json; 1 had a reason for every name, and other names of loop closures
 
 
@@ -206,7 +210,12 @@ class RunFolder:
     def calibration(self) -> list[str]:
         """What the calibration that the run began with found, in sentences; empty: it began with none."""
         cameras = self._json("manifest.json").get("calibration", {}).get("cameras", [])
-        return [line for camera in cameras for line in camera["summary"]]
+        try:
+            return [str(line) for camera in cameras for line in camera["summary"]]
+        except (KeyError, TypeError) as error:
+            raise DuagError(
+                f"{self.path / 'manifest.json'}: calibration.cameras has no summaries, expected one of each"
+            ) from error
 
     @property
     def recording(self) -> Path:
@@ -279,12 +288,22 @@ class RunFolder:
     @property
     def timing(self) -> dict[str, dict[str, Any]]:
         """Stage -> {"robot", "wall_s", "cpu_s", "peak_rss_mb"}; empty if the run has no timing.json."""
-        return self._json("timing.json").get("stages", {})
+        stages = self._json("timing.json").get("stages", {})
+        rows = stages.values() if isinstance(stages, dict) else [None]
+        if not all(isinstance(row, dict) and all(_is_number(row.get(n)) for n in TIMES) for row in rows):
+            raise DuagError(
+                f"{self.path / 'timing.json'}: found no table of {', '.join(TIMES)} of every stage, expected one"
+            )
+        return stages
 
     @property
     def metrics(self) -> dict[str, Any]:
         """metrics.json; empty if the run was not evaluated."""
-        return self._json("metrics.json", METRICS_SCHEMA)
+        metrics = self._json("metrics.json", METRICS_SCHEMA)
+        for name in TABLES if metrics else ():
+            if not isinstance(metrics.get(name), dict):
+                raise DuagError(f"{self.path / 'metrics.json'}: found no table {name}, expected one")
+        return metrics
 
     def _digests(self, robot: str) -> dict[str, str]:
         outputs = self._json("manifest.json").get("outputs", {})
@@ -308,6 +327,10 @@ class RunFolder:
                 found = type(content[key]).__name__
                 raise DuagError(f"{path}: {key} is a {found}, expected a {kind.__name__}")
         return content
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def position_information(geometry: NDArray[np.float32]) -> NDArray[np.float64]:

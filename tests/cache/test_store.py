@@ -330,7 +330,8 @@ def test_a_stage_that_is_finished_leaves_no_checkpoint(bench: Bench) -> None:
 
 def test_gc_of_no_store_is_one_line(tmp_path: Path) -> None:
     assert_one_line(duagc_here("gc", "--store", tmp_path), "expected a store")
-    assert duagc_here("gc", "--store", tmp_path, "--max", "much").returncode == 2
+    for size in ("much", "-5G", "-1"):
+        assert duagc_here("gc", "--store", tmp_path, f"--max={size}").returncode == 2
 
 
 def test_an_entry_says_what_it_was_computed_from(bench: Bench) -> None:

@@ -83,6 +83,19 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_text() == "mine"
 
 
+def test_a_letter_that_the_terminal_lacks_is_replaced() -> None:
+    code = "from duagc.pipeline import cli; cli.app = lambda: print('caf\\u00e9 \\u03c3'); cli.main()"
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "caf? ?\n", "")
+
+
 def test_a_full_disk_is_one_line() -> None:
     command = "lambda: open('/dev/full', 'wb', buffering=0).write(b'a log')"
     code = f"from duagc.pipeline import cli; cli.app = {command}; cli.main()"

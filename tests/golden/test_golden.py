@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.comparison.golden import differences, store
 from duagc.pipeline.recording import LogWriter, log_metadata, read_log
 from tests.golden.command import golden_of
@@ -91,3 +92,17 @@ def test_a_changed_metric_is_named(run: Path, tmp_path: Path) -> None:
     path.write_text(json.dumps(metrics))
     (line,) = differences(golden_of(QUICK), tmp_path / "run")
     assert line.startswith("evaluation: team.ate_rmse_m: 0.2")
+
+
+@pytest.mark.parametrize("damage", ["topics", "files", "metrics", "metadata", "fields"])
+def test_a_golden_run_with_a_list_in_place_of_a_table_is_one_line(tmp_path: Path, damage: str) -> None:
+    golden = tmp_path / "golden.json"
+    shutil.copy(golden_of(QUICK).with_suffix(".npz"), tmp_path / "golden.npz")
+    content = json.loads(golden_of(QUICK).read_text())
+    if damage == "fields":
+        next(iter(next(iter(content["topics"].values())).values()))["fields"] = []
+    else:
+        content[damage] = []
+    golden.write_text(json.dumps(content))
+    with pytest.raises(DuagError, match=r"golden\.json: .*expected a golden run"):
+        differences(golden, tmp_path)

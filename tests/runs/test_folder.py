@@ -12,6 +12,7 @@ from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.preparation import way
 from duagc.pipeline.replay import replay
 from duagc.pipeline.report import write_report
+from duagc.pipeline.runs.digest import ROBOT_RESULTS, TEAM_RESULTS, digest, result_files
 from duagc.pipeline.runs.folder import RunFolder
 from tests.fixtures import fake_run
 
@@ -91,3 +92,57 @@ def test_a_run_below_a_link_to_another_disk_finds_its_recording(tmp_path: Path) 
     (outputs / "run" / "manifest.json").write_text(json.dumps(named))
     for folder in (outputs, disk):
         assert RunFolder(folder / "run").recording == recording.resolve()
+
+
+def read_metrics(run: RunFolder) -> object:
+    return run.metrics
+
+
+def read_timing(run: RunFolder) -> object:
+    return run.timing
+
+
+def read_calibration(run: RunFolder) -> object:
+    return run.calibration
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "read", "complaint"),
+    [
+        ("timing.json", {"stages": []}, read_timing, "found no table of wall_s"),
+        ("timing.json", {"stages": {"exchange": {"wall_s": "1"}}}, read_timing, "found no table of wall_s"),
+        ("metrics.json", {"schema": 2, "a": 1}, read_metrics, "found no table robots"),
+        (
+            "manifest.json",
+            {"calibration": {"cameras": [1]}},
+            read_calibration,
+            r"calibration\.cameras has no summaries",
+        ),
+        ("manifest.json", {"calibration": {"cameras": 1}}, read_calibration, r"calibration\.cameras has no"),
+    ],
+)
+def test_what_somebody_wrote_into_a_run_is_one_line(
+    tmp_path: Path, name: str, content: object, read: Callable[[RunFolder], object], complaint: str
+) -> None:
+    (tmp_path / name).write_text(json.dumps(content))
+    with pytest.raises(DuagError, match=f"{name}: {complaint}"):
+        read(RunFolder(tmp_path))
+
+
+def test_a_run_that_lacks_a_whole_robot_has_no_digest(whole: fake_run.FakeRun, tmp_path: Path) -> None:
+    for robot in ("alpha", "bravo"):
+        for name in ROBOT_RESULTS:
+            path = tmp_path / "run" / "robots" / robot / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(whole.run / "exchange.mcap", path)
+    for name in TEAM_RESULTS:
+        shutil.copy(whole.run / "exchange.mcap", tmp_path / "run" / name)
+    outputs = {path.as_posix(): "" for path in result_files(tmp_path / "run")}
+    (tmp_path / "run" / "manifest.json").write_text(json.dumps({"outputs": outputs}))
+    assert len(digest(tmp_path / "run")) == 64
+    shutil.rmtree(tmp_path / "run" / "robots" / "bravo")
+    with pytest.raises(DuagError, match=r"robots/bravo/.*: not found, expected every result"):
+        digest(tmp_path / "run")
+    (tmp_path / "run" / "manifest.json").write_text('{"outputs": []}')
+    with pytest.raises(DuagError, match=r"manifest\.json: is damaged"):
+        digest(tmp_path / "run")
