@@ -101,6 +101,10 @@ def convert(
             module.convert(Path(src), Path(out), force=force, **count, **{**filed, **said})
         finally:
             USER_MASKS.reset(token)
+    if not (Path(out) / "recording.json").is_file():
+        raise DuagError(
+            f"{dataset}: wrote no {out}/recording.json, expected a recording; see RecordingWriter"
+        )
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_text
@@ -24,10 +24,10 @@ class Tolerance(Config):
     field: str
     """Dotted name of the field; `*` stands for anything."""
 
-    absolute: float = 0.0
+    absolute: float = Field(0.0, ge=0.0)
     """In the unit of the field."""
 
-    relative: float = 0.0
+    relative: float = Field(0.0, ge=0.0)
     """Of the value of the first run, element by element."""
 
     reason: str

@@ -88,3 +88,9 @@ def test_its_mistakes_are_one_line(example: Path, walk: Path, tmp_path: Path) ->
     fails("000003.png: No such file")
     with pytest.raises(DuagError, match="dataset 'replcia', expected perhaps replica"):
         registry.convert("replcia", walk, tmp_path / "rec")
+
+
+def test_a_converter_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("def convert(src, out, robots=1, force=False):\n    pass\n")
+    with pytest.raises(DuagError, match=r"mine\.py: wrote no .*/recording\.json, expected a recording"):
+        registry.convert(str(tmp_path / "mine.py"), tmp_path / "src", tmp_path / "out")
