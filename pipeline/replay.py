@@ -45,8 +45,8 @@ class Comparison:
 
 
 def replay(
-    run: Path,
-    recording: Path,
+    run: str | Path,
+    recording: str | Path,
     robots: list[str],
     report: Callable[[str], None],
 ) -> list[Comparison]:
@@ -71,8 +71,9 @@ def replay(
         raise DuagError(
             "replay: found numpy imported before duagc, expected duagc first: results would differ"
         )
+    run = Path(run)
     config = load_config(RunConfig, RunFolder(run).config_file)
-    logs = Recording(recording)
+    logs = Recording(Path(recording))
     known = RunFolder(run).robots
     check_file(run / "exchange.mcap", "the log of the exchange")
     for robot in robots:  # before hours of work

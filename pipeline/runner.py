@@ -25,14 +25,14 @@ from duagc.pipeline.run_plan import LAST, RunPlan
 
 
 def run(
-    recording_path: Path,
-    out: Path,
+    recording_path: str | Path,
+    out: str | Path,
     config: RunConfig,
     *,
     workers: int = 2,
     force: bool = False,
     calibrate: bool = False,
-    store: Path | None = None,
+    store: str | Path | None = None,
     since: str | None = None,
     until: str = LAST,
     evaluated: bool = True,
@@ -65,6 +65,7 @@ def run(
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
     check_packages(config)
+    recording_path, out, store = Path(recording_path), Path(out), None if store is None else Path(store)
     check_apart(out, [recording_path] if store is None else [recording_path, store])
     plan = RunPlan(
         workers, force, calibrate, store=store, since=since, until=until, evaluated=evaluated, follow=follow

@@ -4,10 +4,12 @@ import inspect
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import duagc
+from tests.fixtures import fake_run
 
 FUNCTIONS_AND_CLASSES = sorted(name for name in duagc.__all__ if not inspect.ismodule(getattr(duagc, name)))
 
@@ -48,3 +50,19 @@ def test_the_package_imports_nothing_heavy() -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="Rasteriser"):
         duagc.Rasteriser  # noqa: B018
+
+
+def test_places_may_be_texts(tmp_path: Path) -> None:
+    fake = fake_run.make(tmp_path)
+    run = str(fake.run)
+    assert list(duagc.RunFolder(run).robots) == ["alpha", "bravo"]
+    odometry = f"{run}/robots/alpha/odometry.tum"
+    duagc.write_tum(f"{run}/copy.tum", duagc.read_tum(odometry))
+    assert len(duagc.read_tum(f"{run}/copy.tum").poses) == len(duagc.read_tum(Path(odometry)).poses)
+    assert duagc.digest(odometry) == duagc.digest(Path(odometry))
+    assert duagc.load_config(duagc.RunConfig, f"{run}/config.toml").seed == 0
+    assert duagc.evaluate(run, str(fake.recording), progress=False)["schema"] == 2
+    with pytest.raises(duagc.DuagError, match=r"fused\.ply: No such file"):
+        duagc.replay(run, str(fake.recording), ["alpha"], print)
+    with pytest.raises(duagc.DuagError, match="exists already"):
+        duagc.run(str(fake.recording), run, duagc.RunConfig(), store=str(tmp_path / "store"))

@@ -106,8 +106,8 @@ def simulate(
     )
     settings.check()
     if scene not in SCENES:
-        check_apart(out, [Path(scene)])
-    _check_output(out, workers, preview)
+        check_apart(Path(out), [Path(scene)])
+    _check_output(Path(out), workers, preview)
     _check_paths(settings, paths)
     determinism.configure_determinism()
     determinism.configure_opencv()

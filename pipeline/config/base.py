@@ -31,7 +31,7 @@ LARGEST = 2**62
 Model = TypeVar("Model", bound=Config)
 
 
-def load_config(model: type[Model], path: Path | None = None, overrides: Sequence[str] = ()) -> Model:
+def load_config(model: type[Model], path: str | Path | None = None, overrides: Sequence[str] = ()) -> Model:
     """Read a configuration.
 
     Args:
@@ -46,7 +46,7 @@ def load_config(model: type[Model], path: Path | None = None, overrides: Sequenc
     if path is not None:
         source = str(path)
         try:
-            values = tomllib.loads(read_text(path, "a TOML configuration"))
+            values = tomllib.loads(read_text(Path(path), "a TOML configuration"))
         except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise DuagError(f"{path}: not valid TOML: {error}") from error
     for override in overrides:

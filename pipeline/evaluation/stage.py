@@ -80,8 +80,8 @@ PROTOCOL = {
 
 
 def evaluate(
-    run_dir: Path,
-    recording: Path,
+    run_dir: str | Path,
+    recording: str | Path,
     *,
     threads: int = 2,
     workers: int = 1,
@@ -112,6 +112,7 @@ def evaluate(
     Raises:
         DuagError: the run or the recording is incomplete or they do not fit together.
     """
+    run_dir, recording = Path(run_dir), Path(recording)
     run, source = RunFolder(run_dir), Recording(recording)
     unknown = sorted({robot_of(name) for name in run.robots} - set(source.robots))
     if unknown:

@@ -33,7 +33,7 @@ class Trajectory:
         return self.poses[:, :3, 3]
 
 
-def write_tum(path: Path, trajectory: Trajectory) -> None:
+def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     """Write a trajectory as `timestamp tx ty tz qx qy qz qw`: seconds with nine decimals, full double precision.
 
     Args:
@@ -45,11 +45,11 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     for stamp, t, q in zip(trajectory.stamps_ns.tolist(), trajectory.positions, quats, strict=True):
         values = " ".join(f"{v:.17g}" for v in (*t, q[1], q[2], q[3], q[0]))
         lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {values}")
-    with new_file(path) as part:
+    with new_file(Path(path)) as part:
         part.write_text("\n".join(lines) + "\n")
 
 
-def read_tum(path: Path) -> Trajectory:
+def read_tum(path: str | Path) -> Trajectory:
     """Read a TUM trajectory.
 
     Args:
@@ -60,7 +60,7 @@ def read_tum(path: Path) -> Trajectory:
         DuagError: the file cannot be read, or a line is not eight finite numbers.
     """
     stamps, rows = [], []
-    text = read_text(path, "a TUM trajectory")
+    text = read_text(Path(path), "a TUM trajectory")
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):

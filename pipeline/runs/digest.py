@@ -38,7 +38,7 @@ def digest_file(path: Path) -> str:
         raise DuagError(f"{path}: {error.strerror or error}, expected a result of a run") from error
 
 
-def digest(path: Path) -> str:
+def digest(path: str | Path) -> str:
     """64 hex characters of a log, a recording, a run, or one of its files.
 
     Args:
@@ -47,6 +47,7 @@ def digest(path: Path) -> str:
     Raises:
         DuagError: the path is absent, or is neither a file, a recording nor a whole run.
     """
+    path = Path(path)
     if path.is_file():
         return digest_file(path)
     if (path / "recording.json").is_file():

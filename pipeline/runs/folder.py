@@ -178,6 +178,9 @@ class RunFolder:
 
     path: Path
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))  # a text will do
+
     @cached_property
     def robots(self) -> dict[str, RobotRun]:
         """Robots by name, in order of the names."""
