@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import platform
 from collections.abc import Iterable
+from importlib import metadata
 from pathlib import Path
 
 from duagc.converters.simulate.render import mesh_process, meshes
 from duagc.converters.simulate.scenes.catalog import SCENES
-from duagc.pipeline.cache.code_identity import PYTHON, library_version
 
 LIBRARIES = (
     "cryptography",
@@ -31,13 +32,20 @@ def code_digest() -> str:
     """Digest of all code that a cell runs through, and of the versions of the libraries that it imports."""
     from duagc import converters, pipeline, schemas
 
-    versions = {"python": PYTHON} | {name: library_version(name) for name in LIBRARIES}
-    digest = hashlib.sha256(json.dumps(versions).encode())
+    digest = hashlib.sha256(json.dumps(library_versions()).encode())
     for package in (converters, pipeline, schemas):
         root = Path(next(iter(package.__path__)))
         for path in _files(root, (".py", ".so", ".binpb")):
             digest.update(f"{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+def library_versions() -> dict[str, list[str]]:
+    """Distributions of the libraries, with their versions, by module, and the version of Python."""
+    installed = metadata.packages_distributions()
+    found = {name: sorted(set(installed.get(name, ()))) for name in LIBRARIES}
+    versions = {name: [f"{d} {metadata.version(d)}" for d in names] for name, names in found.items()}
+    return {"python": list(platform.python_version_tuple()[:2])} | versions
 
 
 def mesh_digest(scene: str) -> dict[str, str]:

@@ -8,12 +8,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from duagc import converters, schemas
 from duagc.converters.simulate.team import simulate
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.bench import length, realtime, whole_runs
+from duagc.pipeline.bench import cell_digests, length, realtime, whole_runs
 from duagc.pipeline.cli import app
 from duagc.pipeline.recording import Recording, content_digest, open_rgbd
 from tests.fixtures.full_disks import no_file_larger_than
@@ -203,3 +205,15 @@ def test_more_processors_than_there_are_are_refused(
     monkeypatch.setattr(whole_runs.os, "sched_getaffinity", lambda _: {0, 1})
     with pytest.raises(DuagError, match="--threads 3: found 2 processors, expected 3"):
         whole_runs.execute(("nothing",), recording.path, tmp_path / "out", processors=3)
+
+
+def test_a_digest_of_robustness_has_versions_and_schemas(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, versions = cell_digests.code_digest(), cell_digests.library_versions()
+    assert versions["numpy"] == [f"numpy {np.__version__}"]
+    with monkeypatch.context() as other:
+        other.setattr(cell_digests, "library_versions", lambda: versions | {"numpy": ["numpy 1"]})
+        assert cell_digests.code_digest() != before
+    with monkeypatch.context() as other:
+        other.setattr(schemas, "__path__", [converters.__path__[0]])
+        assert cell_digests.code_digest() != before
+    assert cell_digests.code_digest() == before

@@ -84,7 +84,7 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_letter_that_the_terminal_lacks_is_replaced() -> None:
-    code = "from duagc.pipeline import cli; cli.app = lambda: print('caf\\u00e9 \\u03c3'); cli.main()"
+    code = "from duagc.pipeline import cli; cli.app = lambda: print('sigma\\u00e9 \\u03c3'); cli.main()"
     result = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -93,7 +93,7 @@ def test_a_letter_that_the_terminal_lacks_is_replaced() -> None:
         check=False,
         env=os.environ | {"PYTHONIOENCODING": "ascii"},
     )
-    assert (result.returncode, result.stdout, result.stderr) == (0, "caf? ?\n", "")
+    assert (result.returncode, result.stdout, result.stderr) == (0, "sigma? ?\n", "")
 
 
 def test_a_full_disk_is_one_line() -> None:
