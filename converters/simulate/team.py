@@ -357,7 +357,7 @@ def _check_output(out: Path, workers: int, preview: Path | None) -> None:
     """Refuse a number of workers or a picture that cannot be."""
     if not 1 <= workers <= MAX_WORKERS:
         raise DuagError(f"simulate: workers is {workers}, expected 1 to {MAX_WORKERS}")
-    if preview is not None and Path(out).resolve() in preview.resolve().parents:
+    if preview is not None and out.resolve() in preview.resolve().parents:
         raise DuagError(f"{preview}: is inside the recording that is replaced, expected a picture elsewhere")
     if preview is not None and preview.exists():
         raise DuagError(f"{preview}: exists already, expected the name of a new picture")

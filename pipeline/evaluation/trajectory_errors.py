@@ -36,9 +36,14 @@ class Paired:
 
 
 def pair(true: Trajectory, estimated: Trajectory) -> Paired:
-    """Pair every estimated pose with the nearest ground-truth pose within 20 ms; poses without one are left out."""
+    """Pair every estimated pose with the nearest ground-truth pose within 20 ms; poses without one are left out.
+
+    Where truth is sparser than the frames, each of its poses goes to the frame that is nearest to it.
+    """
     i, j = associate(estimated, true, ASSOCIATION_TOLERANCE_NS)
-    return Paired(estimated.stamps_ns[i], true.poses[j], estimated.poses[i])
+    first, nearest = associate(true, estimated, ASSOCIATION_TOLERANCE_NS)
+    taken = np.isin(j * len(estimated) + i, first * len(estimated) + nearest)
+    return Paired(estimated.stamps_ns[i[taken]], true.poses[j[taken]], estimated.poses[i[taken]])
 
 
 def alignment(pairs: list[Paired]) -> Array | Absent:
