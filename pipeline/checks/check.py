@@ -124,8 +124,6 @@ def _check_robot(
         moved = geometry.moves(log, config.motion)
         add(geometry.check_moves(robot, moved, config.motion))
         sensors = " ".join(f"{key} {value}" for key, value in log_metadata(log.path).items())
-        if recording is not None:  # "simulation"
-            sensors += f" {recording.description['source'].get('kind', '')}"
         add(geometry.check_range(robot, sight, moved, sensors, config=config.motion))
         prior = log.motion_prior()
         add(_check_scales(recording, log, moved, prior, config=config.motion))

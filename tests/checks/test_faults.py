@@ -20,7 +20,6 @@ from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks import check
 from duagc.pipeline.cli import app
-from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import LogWriter, Record, Recording, read_log
@@ -209,13 +208,6 @@ def test_a_sound_recording_raises_no_alarm(sound: Path, tmp_path: Path) -> None:
     assert check.check(sound).plain() == report.plain()
     again = check.check(planted(sound, tmp_path / "rec", nothing))  # the metadata of the log are lost
     assert [f.check for f in again.findings] == ["digest"]
-
-
-def test_a_simulated_recording_may_see_far(sound: Path) -> None:
-    low = ChecksConfig(motion=MotionChecks(max_depth_m=1.0))
-    assert not check.check(sound, low).findings
-    alone = check.check(sound / "bravo.mcap", low).findings  # nothing says that it is simulated
-    assert [f.check for f in alone] == ["depth scale"]
 
 
 @pytest.mark.parametrize(("change", "calibrate"), [(nothing, False), (late_depth, False), (late_depth, True)])
