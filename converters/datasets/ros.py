@@ -31,12 +31,13 @@ from duagc.converters.logs.derived import Picture, Sweeps
 from duagc.converters.logs.describe import namespaces
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
-from duagc.converters.logs.sources import Source, check_out, pieces_words, sources_of, unread
+from duagc.converters.logs.sources import Source, pieces_words, sources_of, unread
 from duagc.converters.logs.unmeasured import farthest_measured_m
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
+from duagc.pipeline.base.atomic_folder import check_apart
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.base.held_out import is_held_out
@@ -64,7 +65,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
     """
     determinism.configure_opencv()
     sources = sources_of(src, options)
-    check_out(out, sources)
+    check_apart(out, [path for source in sources for path in source.paths])
     if robots and robots != len(sources):
         raise DuagError(f"{src}: found {len(sources)} robots, expected --robots {len(sources)}")
     said = {s.robot: s.settings.model_dump() for s in sources}

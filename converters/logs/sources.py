@@ -229,23 +229,6 @@ def _remedy(path: Path) -> str:
     return next((words for end, words in REMEDIES.items() if path.name.endswith(end)), "")
 
 
-def check_out(out: Path, sources: Sequence[Source]) -> None:
-    """Refuse to write over what is read.
-
-    Args:
-        out: folder of the recording.
-        sources: of all robots.
-    Raises:
-        DuagError: a log is the folder, or lies in it.
-    """
-    place = out.resolve()
-    for path in (path for source in sources for path in source.paths):
-        if place == path.resolve() or place in path.resolve().parents:
-            raise DuagError(
-                f"{out}: holds {path.name}, which is to be read; expected another folder for --out"
-            )
-
-
 def pieces_words(sources: Sequence[Source], spans_ns: Mapping[str, tuple[int, int]]) -> str:
     """What to say of logs that are pieces of one, by their names and times; empty: they are not.
 

@@ -97,24 +97,24 @@ def read_g2o(path: Path) -> Edges:
     values = np.array(rows)
     upper = values[:, 7:]
     _check_motions(path, lines, values[:, :3], values[:, 3:7])
-    _check(path, lines, "information", np.abs(upper).max(axis=1), (0.0, WEIGHTS[1]))
+    _check(path, lines, "information", np.abs(upper).max(axis=1), limits=(0.0, WEIGHTS[1]))
     diagonal = upper[:, np.equal(*np.triu_indices(6))]
     positive = np.where(diagonal > 0, diagonal, np.inf).min(axis=1)  # others are refused for their sign
-    _check(path, lines, "information", np.where(np.isinf(positive), 1.0, positive), WEIGHTS)
+    _check(path, lines, "information", np.where(np.isinf(positive), 1.0, positive), limits=WEIGHTS)
     kappa, tau = _isotropic(upper, path)
-    _check(path, lines, "kappa", kappa, WEIGHTS)
-    _check(path, lines, "tau", tau, WEIGHTS)
+    _check(path, lines, "kappa", kappa, limits=WEIGHTS)
+    _check(path, lines, "tau", tau, limits=WEIGHTS)
     return Edges(i, j, se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3]), kappa, tau)
 
 
 def _check_motions(path: Path, lines: list[int], t: Array, quats: Array) -> None:
     """Refuse motions that no robot can send on, and quaternions [m, 4] that hardly are any."""
     lengths, norms = (np.hypot.reduce(v, axis=1) for v in (t, quats))  # squares might overflow
-    _check(path, lines, "translation in m", lengths, (0.0, MAX_TRANSLATION_M))
-    _check(path, lines, "quaternion norm", norms, QUATERNION_NORMS)
+    _check(path, lines, "translation in m", lengths, limits=(0.0, MAX_TRANSLATION_M))
+    _check(path, lines, "quaternion norm", norms, limits=QUATERNION_NORMS)
 
 
-def _check(path: Path, lines: list[int], topic: str, found: Array, limits: tuple[float, float]) -> None:
+def _check(path: Path, lines: list[int], topic: str, found: Array, *, limits: tuple[float, float]) -> None:
     """Refuse the first line whose value is not within the limits."""
     least, most = limits
     outside = np.flatnonzero(~((found >= least) & (found <= most)))
@@ -185,6 +185,6 @@ def read_kimera(path: Path) -> Edges:
         raise DuagError(f"{path}: no measurements in this file")
     v = np.array(rows)
     _check_motions(path, lines, v[:, 4:7], v[:, :4])
-    _check(path, lines, "kappa", v[:, 7], WEIGHTS)
-    _check(path, lines, "tau", v[:, 8], WEIGHTS)
+    _check(path, lines, "kappa", v[:, 7], limits=WEIGHTS)
+    _check(path, lines, "tau", v[:, 8], limits=WEIGHTS)
     return Edges(i, j, se3.from_quat_translation(v[:, [3, 0, 1, 2]], v[:, 4:7]), v[:, 7], v[:, 8])

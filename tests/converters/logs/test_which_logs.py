@@ -44,8 +44,10 @@ def test_a_recording_does_not_replace_its_source(tmp_path: Path) -> None:
     r = Ros(2)
     bag = r.write(tmp_path / "bag", still(r), "sqlite3")
     (bag / "recording.json").write_text("{}")
-    with pytest.raises(DuagError, match=r"holds bag, which is to be read; expected another folder for --out"):
+    with pytest.raises(DuagError, match=r"found .*bag in it, expected --out apart from what is read"):
         registry.convert("ros", bag, bag, force=True)
+    with pytest.raises(DuagError, match=r"found .*bag in it, expected --out apart from what is read"):
+        registry.convert("ros", tmp_path, bag, force=True)
     assert (bag / "bag.db3").is_file()
 
 
