@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.frontend.failure import Reason
@@ -13,6 +12,7 @@ from duagc.pipeline.frontend.submaps import TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 
 HARDLY_WORSE_S = 0.01
+NEAREST_PERCENT = 10
 
 
 def median_depth_m(tracked: TrackedLog) -> float:
@@ -25,17 +25,22 @@ def median_depth_m(tracked: TrackedLog) -> float:
     return float(np.median(depths_m)) if depths_m else np.inf
 
 
-def largest_depth_offset_s(offsets_ns: NDArray[np.int64], usual_s: float) -> float:
+def largest_depth_offset_s(pairs: Sequence[tuple[int, int | None]], usual_s: float) -> float:
     """By which depth may be earlier or later than its color, of a frame that others are registered to.
 
     Cameras that are not synchronized may never be as near as usual: then the tenth of the frames that are nearest
     count, and those that are hardly worse.
 
     Args:
-        offsets_ns: of all frames that have depth.
+        pairs: time of the color and of the depth of every frame of a log, ns; those that are held out do not count.
         usual_s: where a tenth of the frames has depth as near.
     """
-    nearest_s = float(np.percentile(np.abs(offsets_ns), 10)) * 1e-9 if len(offsets_ns) else 0.0
+    offsets_ns = [
+        abs(depth - color)
+        for k, (color, depth) in enumerate(pairs)
+        if depth is not None and not is_held_out(k)
+    ]
+    nearest_s = float(np.percentile(offsets_ns, NEAREST_PERCENT)) * 1e-9 if offsets_ns else 0.0
     return usual_s if nearest_s <= usual_s else nearest_s + HARDLY_WORSE_S
 
 

@@ -220,7 +220,7 @@ class _Tracking:
     def _tracker(self) -> SubmapTracker | OtherTracker:
         """As the configuration asks for; others than the usual one are imported by need."""
         camera, config = self.log.camera, self.config
-        limit_s = largest_depth_offset_s(self.log.pairing.offsets_ns, config.keyframes.max_depth_offset_s)
+        limit_s = largest_depth_offset_s(self.log.pairing.pairs, config.keyframes.max_depth_offset_s)
         if config.tracking.method == "registration":
             return SubmapTracker(camera, config, self.motion, max_depth_offset_s=limit_s)
         keyframes = config.keyframes.model_copy(update={"max_depth_offset_s": limit_s})

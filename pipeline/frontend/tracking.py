@@ -57,9 +57,9 @@ class Tracker:
                 registered to; None: as configured.
         """
         self.camera = camera
-        if max_depth_offset_s is None:
-            max_depth_offset_s = config.keyframes.max_depth_offset_s
-        self.state = TrackingState(config, motion, max_depth_offset_s)
+        self.state = TrackingState(config, motion)
+        if max_depth_offset_s is not None:
+            self.state.max_depth_offset_s = max_depth_offset_s
         self._relocalizer = Relocalizer()
 
     @property
@@ -289,9 +289,7 @@ class Tracker:
         """
         occlusion = self.state.occlusion
         leaving = min(result.overlap, result.view) < self.state.config.tracking.relocalization.min_overlap
-        if leaving and not occlusion.occluded:
-            occlusion.active = False
-        return not occlusion.active
+        return not occlusion.active or (leaving and not occlusion.occluded)
 
     def _is_near(self, depth_offset_ns: int) -> bool:
         """Whether depth was taken so near in time to its color that others may be registered to it."""

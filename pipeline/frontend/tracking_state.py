@@ -105,8 +105,6 @@ class TrackingState:
     Attributes:
         config: of the front end.
         motion: how the camera moved by other sensors, where the log has any.
-        max_depth_offset_s: by which depth may be earlier or later than its color, of a frame that others are
-            registered to.
         keyframes: all of them.
         pairs: registrations between keyframes.
         keyframe_index: the keyframe that frames are tracked against.
@@ -124,6 +122,8 @@ class TrackingState:
         recent: time and T_map_camera of the last frames that were tracked without a loss between them.
         turns: by a gyroscope and by the images, of the last frames that the images determine.
         gyro: what these say of the gyroscope.
+        max_depth_offset_s: by which depth may be earlier or later than its color, of a frame that others are
+            registered to.
         intervals: between frames.
         frozen: detects frozen images.
         occlusion: detects objects in front of the camera.
@@ -131,7 +131,6 @@ class TrackingState:
 
     config: FrontendConfig
     motion: MotionPrior | None = None
-    max_depth_offset_s: float = 0.0
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
     pairs: list[RelativePose] = field(default_factory=list)
     keyframe_index: int = 0
@@ -149,11 +148,13 @@ class TrackingState:
     recent: list[tuple[int, Array]] = field(default_factory=list)
     turns: list[Turn] = field(default_factory=list)
     gyro: GyroCorrection = field(default_factory=GyroCorrection)
+    max_depth_offset_s: float = field(init=False)
     intervals: FrameIntervals = field(init=False)
     frozen: FrozenImageDetector = field(init=False)
     occlusion: OcclusionDetector = field(init=False)
 
     def __post_init__(self) -> None:
+        self.max_depth_offset_s = self.config.keyframes.max_depth_offset_s
         self.intervals = FrameIntervals(self.config.tracking.failure.interval_frames)
         self.frozen = FrozenImageDetector(self.config.tracking.failure)
         self.occlusion = OcclusionDetector(self.config.tracking.failure)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.frontend.depth_quality import largest_depth_offset_s
 from duagc.pipeline.frontend.stage import run_frontend
@@ -107,8 +108,16 @@ def test_depth_that_is_never_near_in_time_makes_a_map(tmp_path: Path) -> None:
 
 
 def test_how_near_depth_must_be_is_by_the_log() -> None:
-    offsets = np.array([1, -2, 3, 40, 90, -100, 70, 80, 20, 60]) * 1_000_000
-    assert largest_depth_offset_s(offsets, 0.03) == 0.03
-    assert largest_depth_offset_s(offsets + 200_000_000, 0.03) > 0.1
-    assert largest_depth_offset_s(np.full(20, -40_000_000), 0.03) == pytest.approx(0.05)
-    assert largest_depth_offset_s(np.zeros(0, np.int64), 0.03) == 0.03
+    def limit_s(*offsets_ms: int) -> float:
+        """Of ten frames between each two that are held out, where depth would be perfect."""
+        pairs = iter([(0, ms * 1_000_000) for ms in offsets_ms])
+        of_log = [
+            (0, 0) if is_held_out(k) else next(pairs, (0, None)) for k in range(2 * len(offsets_ms) + 20)
+        ]
+        return largest_depth_offset_s(of_log, 0.03)
+
+    offsets = (1, -2, 3, 40, 90, -100, 70, 80, 20, 60)
+    assert limit_s(*offsets) == 0.03
+    assert limit_s(*(200 + ms for ms in offsets)) > 0.1
+    assert limit_s(*[-40] * 20) == pytest.approx(0.05)
+    assert limit_s() == 0.03

@@ -308,12 +308,11 @@ def test_an_object_does_not_hold_back_a_keyframe_where_the_camera_leaves_the_vie
     """What was seen before can no more tell that the object is gone."""
     tracker = Tracker(ROOM_CAMERA, FrontendConfig())
     occlusion = tracker.state.occlusion
-    for occluded, overlap, free in [
-        (True, 0.3, False),
-        (False, 0.7, False),
-        (False, 0.3, True),
-        (False, 0.7, True),
+    for active, occluded, overlap, free in [
+        (True, True, 0.3, False),
+        (True, False, 0.7, False),
+        (True, False, 0.3, True),
+        (False, False, 0.7, True),
     ]:
-        occlusion.active = not free or occlusion.active
-        occlusion.occluded = occluded
+        occlusion.active, occlusion.occluded = active, occluded
         assert tracker._is_unoccluded(SimpleNamespace(overlap=overlap, view=0.9)) is free
