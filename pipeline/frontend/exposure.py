@@ -93,16 +93,6 @@ class ColorBlocks:
         taken = frame.color[rows, columns]
         color = taken * np.float32(1 / 255)
         color[(taken < CLIPPED[0]) | (taken > CLIPPED[1])] = np.nan
-        depth_m = frame.usable_depth[rows, columns]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = np.where(depth_m > 0, 1 / depth_m, np.float32(np.nan)).astype(np.float32)
-            middle = _smooth(mean(inverse), mean(inverse * inverse))
-            known = mean((depth_m > 0).astype(np.float32))
-            known[known < LEAST_KNOWN] = np.nan
-            inverse[depth_m <= 0] = 0
-            without_holes = _smooth(mean(inverse) / known, mean(inverse * inverse) / known)
-            if np.count_nonzero(middle > 0) < LEAST_WHOLE * np.count_nonzero(without_holes > 0):
-                middle = without_holes
         scaled = PinholeCamera(
             width=width,
             height=height,
@@ -113,7 +103,7 @@ class ColorBlocks:
         )
         if frame.mask is not None:
             color[~frame.mask[rows, columns]] = np.nan
-        return ColorBlocks(scaled, mean(color), middle)
+        return ColorBlocks(scaled, mean(color), _inverse_depth(frame.usable_depth[rows, columns], mean))
 
     def shared_with(self, other: ColorBlocks, T_self_other: Array) -> tuple[Array, Array]:
         """Colors [n, 3] of both frames where they show the same surface.
@@ -150,6 +140,21 @@ class ColorBlocks:
             same = np.abs(found[:, 3] * there[:, 2] - 1) < SAME_SURFACE
         same &= np.isfinite(found).all(axis=1)
         return self.color[v[same], u[same]].astype(np.float64), found[same, :3].astype(np.float64)
+
+
+def _inverse_depth(
+    depth_m: NDArray[np.float32], mean: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Inverse depth [h, w] of blocks, 1/m, by means over blocks; where holes are scattered, of the pixels without."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(depth_m > 0, 1 / depth_m, np.float32(np.nan)).astype(np.float32)
+        whole = _smooth(mean(inverse), mean(inverse * inverse))
+        known = mean((depth_m > 0).astype(np.float32))
+        known[known < LEAST_KNOWN] = np.nan
+        inverse[depth_m <= 0] = 0
+        without_holes = _smooth(mean(inverse) / known, mean(inverse * inverse) / known)
+        scattered = np.count_nonzero(whole > 0) < LEAST_WHOLE * np.count_nonzero(without_holes > 0)
+    return without_holes if scattered else whole
 
 
 def _smooth(mean: NDArray[np.float32], mean_square: NDArray[np.float32]) -> NDArray[np.float32]:
