@@ -6,11 +6,11 @@ import hashlib
 import json
 import platform
 from collections.abc import Iterable
-from importlib import metadata
 from pathlib import Path
 
 from duagc.converters.simulate.render import mesh_process, meshes
 from duagc.converters.simulate.scenes.catalog import SCENES
+from duagc.pipeline.base.library_versions import library_version
 
 LIBRARIES = (
     "cryptography",
@@ -40,12 +40,10 @@ def code_digest() -> str:
     return digest.hexdigest()
 
 
-def library_versions() -> dict[str, list[str]]:
-    """Distributions of the libraries, with their versions, by module, and the version of Python."""
-    installed = metadata.packages_distributions()
-    found = {name: sorted(set(installed.get(name, ()))) for name in LIBRARIES}
-    versions = {name: [f"{d} {metadata.version(d)}" for d in names] for name, names in found.items()}
-    return {"python": list(platform.python_version_tuple()[:2])} | versions
+def library_versions() -> dict[str, str]:
+    """Versions of the libraries, by module, and that of Python."""
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"python": python} | {name: library_version(name) for name in LIBRARIES}
 
 
 def mesh_digest(scene: str) -> dict[str, str]:

@@ -12,26 +12,17 @@ import hashlib
 import json
 import sys
 from dataclasses import dataclass
-from importlib import metadata
 from importlib.machinery import EXTENSION_SUFFIXES
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import duagc
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.library_versions import library_version
 from duagc.pipeline.cache.publish import publish
 
 PACKAGE = "duagc"
 DATA_SUFFIXES = (".binpb", ".j2", ".css")
-DISTRIBUTIONS = {
-    "cv2": "opencv-python-headless",
-    "google": "protobuf",
-    "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
-    "rerun": "rerun-sdk",
-    "open3d": "open3d-cpu",
-}
-"""Distributions of the modules that are not named as they are."""
 SHOWN_ONLY = frozenset({"rich", "typer", "lazy_loader", "tomlkit"})
 """Libraries that no result depends on."""
 PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -248,18 +239,3 @@ class _Stripped(ast.NodeTransformer):
 
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def library_version(library: str) -> str:
-    """Version of an installed library; "" if it is not installed.
-
-    Args:
-        library: name of its module. It may be of another distribution than is usual, which then is named, or of none.
-    """
-    try:
-        return metadata.version(DISTRIBUTIONS.get(library, library))
-    except metadata.PackageNotFoundError:
-        if find_spec(library) is None:
-            return ""
-    names = sorted(set(metadata.packages_distributions().get(library, ())))
-    return ", ".join(f"{name} {metadata.version(name)}" for name in names) or "unknown"

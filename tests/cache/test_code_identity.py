@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.library_versions import DISTRIBUTIONS, library_version
 from duagc.pipeline.bench import cell_digests
-from duagc.pipeline.cache.code_identity import DISTRIBUTIONS, CodeReader, library_version
+from duagc.pipeline.cache.code_identity import CodeReader
 from duagc.pipeline.experiments.carry_out import SIMULATOR
 from duagc.pipeline.runs import stages
 
