@@ -35,7 +35,7 @@ def bench_raster(
     """
     from duagc.pipeline.bench import raster, raster_tables
     from duagc.pipeline.kernels import available_isas
-    from duagc.pipeline.kernels.rasterizer import MAX_THREADS
+    from duagc.pipeline.kernels.arguments import MAX_THREADS
 
     isas = available_isas() if isa is None else isa.split(",")
     for name in isas:

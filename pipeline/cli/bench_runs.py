@@ -44,7 +44,7 @@ def bench_realtime(
     `duagc bench realtime recordings/redkitchen --robots 2 --threads 2 --other ../before/.venv/bin/duagc`
     """
     from duagc.pipeline.bench import realtime
-    from duagc.pipeline.kernels.rasterizer import MAX_THREADS
+    from duagc.pipeline.kernels.arguments import MAX_THREADS
 
     if no_evaluation and other is not None:
         raise typer.BadParameter("other versions may not know it", param_hint="--no-evaluation")

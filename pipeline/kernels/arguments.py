@@ -6,9 +6,11 @@ Every complaint is a ValueError that names the argument, what was found and what
 from __future__ import annotations
 
 import math
+import operator
 import reprlib
 from enum import IntEnum
 from numbers import Real
+from typing import SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +22,7 @@ from duagc.pipeline.splat.information import GEOMETRY_SIZE
 
 Image = NDArray[np.float32]
 MAX_SIDE_PX = 16384
+MAX_THREADS = 1024
 LARGEST_LOG_SCALE = 40.0  # of meters; as in visibility.h
 ROTATION_TOLERANCE = 1e-4  # of R^T R - I; a pose read from six decimals passes
 NOT_FINITE = "a NaN or an infinity"
@@ -175,6 +178,17 @@ def check_sums(sums: object, n: int) -> None:
         expected["diagonal"] = ((n, FISHER_DIAGONAL_COLUMNS), np.float64)
     for name, (shape, dtype) in expected.items():
         check_array(f"sums.{name}", getattr(sums, name), shape, dtype)
+
+
+def checked_threads(threads: object) -> int:
+    """A number of threads.
+
+    Args:
+        threads: as it was given.
+    """
+    if not isinstance(threads, SupportsIndex) or not 1 <= operator.index(threads) <= MAX_THREADS:
+        raise ValueError(f"threads is {threads!r}, expected a whole number from 1 to {MAX_THREADS}")
+    return operator.index(threads)
 
 
 def checked_image(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from dataclasses import astuple
 from numbers import Real
 from typing import Any, SupportsIndex
@@ -30,6 +29,7 @@ from duagc.pipeline.kernels.arguments import (
     checked_image,
     checked_mask,
     checked_pose,
+    checked_threads,
     complaint_about,
     refuse_bad_image,
 )
@@ -46,18 +46,11 @@ from duagc.pipeline.kernels.types import (
 )
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 
-MAX_THREADS = 1024
 MAX_GAUSSIANS = 2**30
 SAME_LAYER = 0.05  # relative difference of depth
 
 _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)
-
-
-def _checked_threads(threads: object) -> int:
-    if not isinstance(threads, SupportsIndex) or not 1 <= operator.index(threads) <= MAX_THREADS:
-        raise ValueError(f"threads is {threads!r}, expected a whole number from 1 to {MAX_THREADS}")
-    return operator.index(threads)
 
 
 def available_isas() -> list[str]:
@@ -84,7 +77,7 @@ class Rasterizer:
         """
         if not isinstance(isa, str) or isa not in ("auto", *available_isas()):
             raise ValueError(f"isa is {isa!r}, available here: auto, {', '.join(available_isas())}")
-        _checked_threads(threads)
+        checked_threads(threads)
         self.threads = threads
         self._raster = _raster.Raster(isa)
         self._gaussians: Gaussians | None = None
@@ -222,7 +215,7 @@ class Rasterizer:
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         wanted = _NO_MASK if mask is None else checked_mask(mask, (height, width))
-        ray_plane, threads = depth_kind == "ray_plane", _checked_threads(self.threads)
+        ray_plane, threads = depth_kind == "ray_plane", checked_threads(self.threads)
         return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, threads)
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
