@@ -77,6 +77,47 @@ def found_afterwards(
     return out
 
 
+def registered_again(
+    frames: Sequence[TrackedFrame],
+    before: Sequence[TrackedFrame],
+    keyframes: Sequence[TrackedKeyframe],
+    images: Images,
+    *,
+    config: FrontendConfig,
+) -> list[TrackedFrame]:
+    """The frames, with better poses of those that were found while nothing said how the camera moved then.
+
+    Their depth and their rows were as they were taken; by the poses that were found they are moved now.
+
+    Args:
+        frames: every frame of the log, with those that were found.
+        before: the same frames before any was looked for again.
+        keyframes: of the map.
+        images: reads the images of a frame of the log, by its index, as they are moved now.
+        config: of the front end.
+    """
+    tracking = config.tracking.verified_by_features()
+    out = list(frames)
+    for k, (frame, was) in enumerate(zip(frames, before, strict=True)):
+        if frame.status is Status.LOST or was.status is not Status.LOST:
+            continue
+        keyframe = keyframes[frame.keyframe_index]
+        pyramid = images(frame.frame_index, len(tracking.strides))
+        result = register_until_stable(
+            keyframe, pyramid, frame.T_keyframe_camera, tracking, first=tracking.registration
+        )
+        features = features_of(pyramid, tracking.relocalization)
+        if result.ok and _confirmed(keyframe, features, result, config, rng=_draws(frame, keyframe)):
+            out[k] = TrackedFrame.by(
+                frame.frame_index,
+                frame.stamp_ns,
+                keyframe_index=frame.keyframe_index,
+                result=result,
+                status=frame.status,
+            )
+    return out
+
+
 def _found(
     k: int,
     frames: Sequence[TrackedFrame],
@@ -127,10 +168,7 @@ def _registrations(
     limits, failure = tracking.relocalization, tracking.failure
     features = features_of(pyramid, limits)
     for keyframe in keyframes:
-        # the draws only choose which samples are tried: the same in every run
-        rng = random_streams.generator(
-            0, "look_again", frame=frame.frame_index, keyframe=keyframe.keyframe_index
-        )
+        rng = _draws(frame, keyframe)
         moved = motion_from_features(keyframe.features, features, limits, rng)
         if moved.T_first_second is None or not moved.accepted:
             continue
@@ -144,6 +182,13 @@ def _registrations(
         )
         if violations <= failure.max_free_space_violations * visible:
             yield keyframe, result
+
+
+def _draws(frame: TrackedFrame, keyframe: TrackedKeyframe) -> np.random.Generator:
+    """Which samples are tried: the same in every run."""
+    return random_streams.generator(
+        0, "look_again", frame=frame.frame_index, keyframe=keyframe.keyframe_index
+    )
 
 
 def _confirmed(

@@ -32,6 +32,7 @@ from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector,
 from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
 from duagc.pipeline.frontend.kept_pyramids import KeptPyramids
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
+from duagc.pipeline.frontend.lost_frames import registered_again
 from duagc.pipeline.frontend.other_tracker import OtherTracker
 from duagc.pipeline.frontend.output import (
     BuiltMap,
@@ -298,8 +299,20 @@ class _ComponentStage:
             return optimization.run(component.keyframes, frames, component.pairs)
 
         optimized = save.done(part, optimize)  # the images that it kept are gone now
-        solution, frames = optimized.solution, optimized.frames
+        solution, tracked_frames, frames = optimized.solution, frames, optimized.frames
         log.move_depth(tracked_path(frames, solution.T_map_keyframe))
+        if log.needs_motion:
+            frames = save.done(
+                f"{part}.found",
+                lambda: registered_again(
+                    optimized.frames,
+                    tracked_frames,
+                    optimized.keyframes,
+                    _images(log),
+                    config=self.config,
+                ),
+            )
+            log.move_depth(tracked_path(frames, solution.T_map_keyframe))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
         part = f"{self.name}.exposures"
         estimation = ExposureEstimation(log.frame, log.camera, self.config.exposure, save, part)

@@ -81,6 +81,33 @@ def test_depth_that_is_late_and_early_in_turn_is_moved(tmp_path: Path) -> None:
     assert np.sqrt(np.mean(moved**2)) < 0.5 * np.sqrt(np.mean(taken**2))
 
 
+def covered_log(folder: Path, late_ns: int, covered: range) -> Path:
+    """A walk whose lens is covered for some frames; depth is always taken some time after the images."""
+    with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
+        for k in range(covered.stop + 8):
+            gray, depth_m = render(walk(k))[0], render(walk(k + late_ns / FRAME_NS))[1]
+            seen = k not in covered
+            image = np.repeat(
+                np.rint(np.clip(gray * seen, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2
+            )
+            robot.add_frame(
+                k * FRAME_NS,
+                cv2.imencode(".png", image)[1].tobytes(),
+                "png",
+                np.rint(depth_m * seen / 0.0005).astype(np.uint16),
+                depth_stamp_ns=k * FRAME_NS + late_ns,
+            )
+    return folder / "alpha.mcap"
+
+
+def test_a_frame_that_was_found_afterwards_has_its_depth_moved(tmp_path: Path) -> None:
+    """The first frame after a loss is only confirmed by the next ones: while it was lost nothing moved its depth."""
+    frames = tracked(covered_log(tmp_path / "rec", 10_000_000, range(14, 20)))
+    assert [f.status for f in frames[14:21]] == ["lost"] * 6 + ["relocalized"]
+    T_found = se3.inverse(frames[21].T_map_camera) @ frames[20].T_map_camera
+    assert se3.distance(T_found, se3.inverse(walk(21)) @ walk(20))[0] < 0.001
+
+
 def slow_log(folder: Path, late_ns: int, stated: bool, frames: int) -> Path:
     """Ten images a second; depth is always taken some time after them."""
     with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
