@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.consensus import ColorConfig
+from duagc.pipeline.consensus import matching
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import MapMatching, gaussian_distance, match, threshold, tracks
 from duagc.pipeline.geometry import so3, spd
@@ -189,6 +190,30 @@ def test_tracks_of_five_robots_are_what_a_plain_search_finds(seed):
     expected = sorted(parts(edges), key=sorted)
     assert any(len(p) > 2 for p in expected)
     assert groups(evidence, pairs) == expected
+
+
+def test_many_robots_that_saw_the_same_are_joined_at_once(monkeypatch):
+    """Matches of eight robots connect all their Gaussians: one by one their worst pairs would take hours."""
+    rng = np.random.default_rng(0)
+    names = [f"robot{k}" for k in range(8)]
+    evidence = {}
+    for name in names:
+        theta = identical(name, list(range(60))).theta + np.eye(13)[12] * rng.normal(size=(60, 1))
+        evidence[name] = replace(identical(name, list(range(60))), theta=theta)
+    pairs = {
+        (a, b): np.stack([rng.permutation(60)[:40], rng.permutation(60)[:40]], axis=1)
+        for i, a in enumerate(names)
+        for b in names[i + 1 :]
+    }
+    calls = []
+    plain = matching.csgraph.connected_components
+    monkeypatch.setattr(
+        matching.csgraph, "connected_components", lambda *a, **k: calls.append(1) or plain(*a, **k)
+    )
+    found = tracks(evidence, pairs, CONFIG)
+    assert len(calls) <= 2
+    assert len(np.unique(found.track)) > 60
+    assert len({*zip(found.track.tolist(), found.robot.tolist(), strict=True)}) == len(found.track)
 
 
 def test_pairs_of_gaussians_that_never_arrived_are_left_out():
