@@ -62,7 +62,10 @@ class PeerValidationConfig(Config):
     passes: int = Field(default=2, ge=1)
     """Times that the map is rendered; Gaussians behind a contradicted one are judged in the next pass."""
     max_size_ratio: float = Field(default=2.0, gt=0.0)
-    """Largest Gaussian of a peer, in units of the largest of the own map: no mapper makes a larger one."""
+    """Largest Gaussian of a peer, in units of the largest of the own map, but at least `max_size_m`."""
+    max_size_m: float = Field(default=0.5, ge=0.0)
+    """Size up to which no Gaussian is too large, however small the own ones are: twice the largest that a mapper makes
+    (`frontend.mapping.max_scale_m`)."""
     match_radius_factor: float = Field(default=2.0, gt=0.0)
     """Matched Gaussians may be this many matching radii apart, so that rounding rejects no match of an honest robot."""
     match_distance_factor: float = Field(default=1.5, gt=0.0)

@@ -49,7 +49,7 @@ class PeerCheck:
     Attributes:
         peer: name of the robot that sent the map.
         gaussians: Gaussians that it sent.
-        too_large: of them, not used because no mapper makes any that large.
+        too_large: of them, not used because they are larger than a mapper makes any.
         contradicted: of them, not used because own images contradict them.
         compared_px: own pixels on which the map was compared.
         own_px: all own pixels.
@@ -133,7 +133,8 @@ def validate_peer_maps(
     own_colors = _ColorStatistics(config.min_color_variance)
     for view in views:
         own_colors.add(view.unit_color[... if view.mask is None else view.mask])
-    largest_m = config.max_size_ratio * _sizes_m(own).max() if len(own) else np.inf
+    own_m = _sizes_m(own).max() if len(own) else np.inf
+    largest_m = max(config.max_size_ratio * own_m, config.max_size_m)
     radius_m = config.match_radius_factor * matching.radius_m
     world, contradicted, judged = {own.owner: own}, {}, {}
     too_large = {}
@@ -147,8 +148,14 @@ def validate_peer_maps(
         used = slice(None) if judged[name].trusted(own_colors.pixels) else slice(0, 0)
         world[name], contradicted[name] = peer.select(used), against[used]
         judged[name].num_contradicted = int(np.sum(against))
-    largest = config.match_distance_factor * threshold(own, matching)
-    true = _true_pairs(world, pairs, matching, radius_m=radius_m, largest=largest)
+    true = _true_pairs(
+        world,
+        pairs,
+        matching,
+        radius_m=radius_m,
+        factor=config.match_distance_factor,
+        own_threshold=threshold(own, matching),
+    )
     checks = []
     for name, check in judged.items():
         matches = len(_between(pairs, own.owner, name))
@@ -209,14 +216,19 @@ def _true_pairs(
     matching: MapMatching,
     *,
     radius_m: float,
-    largest: float,
+    factor: float,
+    own_threshold: float,
 ) -> dict[tuple[str, str], Index]:
-    """The pairs whose Gaussians exist, are near each other and alike: d_G at most `largest`."""
+    """The pairs whose Gaussians exist, are near each other and alike: d_G at most `factor` times tau_G.
+
+    That of the own map, where it has neighbors; else that of the map by which the pair was matched.
+    """
     true = {}
     for a, b in sorted(p for p in pairs if p[0] in world and p[1] in world):
         near = _near(world[a], world[b], pairs[a, b], radius_m)
         i, j = rows_by_id(near[:, 0], world[a].ids), rows_by_id(near[:, 1], world[b].ids)
         other = _in_colors_of(world[a], world[b], near, matching)
+        largest = factor * (own_threshold or threshold(world[a], matching))
         true[a, b] = near[gaussian_distance(world[a], i, other, j, config=matching) <= largest]
     return true
 

@@ -196,3 +196,43 @@ def test_an_empty_own_map_takes_no_gaussian_for_too_large(views):
     check = validated_by_alpha(views, map_of("bravo"), empty=True).checks[0]
     assert (check.gaussians, check.too_large) == (N, 0)
     assert check.trusted
+
+
+def shrunk(robot: str, factor: float) -> Evidence:
+    evidence = map_of(robot)
+    theta = evidence.theta.copy()
+    theta[:, LOG_COVARIANCE] += 2 * np.log(factor) * np.array([1, 1, 1, 0, 0, 0])
+    return replace(evidence, theta=theta)
+
+
+def test_a_robot_with_small_gaussians_takes_a_peer_s_of_usual_size(views):
+    """A camera near its surfaces makes small discs; twice the largest of them is less than others' usual ones."""
+    ids = 10 + np.arange(N)
+    bravo = map_of("bravo")
+    validated = validate_peer_maps(
+        shrunk("alpha", 0.2).in_world(HERE),
+        {"bravo": bravo.in_world(HERE)},
+        {("alpha", "bravo"): np.stack([ids, ids], axis=1)},
+        MapContext(CAMERA, FusionConfig(), MapMatching()),
+        views=views,
+        depth_kinds={"bravo": "blended"},
+        arrived={"bravo": 1.0},
+    )
+    assert (validated.checks[0].too_large, len(validated.evidence["bravo"])) == (0, N)
+
+
+@pytest.mark.parametrize("own", [0, 1])
+def test_without_neighbors_of_its_own_a_robot_believes_matches_of_two_peers(views, own):
+    """tau_G of an own map without neighbors is zero: no two Gaussians are that much alike."""
+    ids = 10 + np.arange(N)
+    peers = {name: map_of(name).in_world(HERE) for name in ("bravo", "charlie")}
+    validated = validate_peer_maps(
+        map_of("alpha").select(slice(own)).in_world(HERE),
+        peers,
+        {("bravo", "charlie"): np.stack([ids, ids], axis=1)},
+        MapContext(CAMERA, FusionConfig(), MapMatching()),
+        views=views,
+        depth_kinds=dict.fromkeys(peers, "blended"),
+        arrived=dict.fromkeys(peers, 1.0),
+    )
+    assert len(validated.pairs["bravo", "charlie"]) > 0.9 * N
