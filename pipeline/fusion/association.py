@@ -81,8 +81,8 @@ class TrackMembers:
 
     Attributes:
         rows: their evidence, [r] members.
-        reference: [g], row of every track that its fused value refers to: the receiver's, or that of the robot of the
-            lowest name.
+        reference: [g], row of every track that its fused value refers to: the receiver's, or that which knows its
+            position best.
         first: [g], first row of every track.
     """
 

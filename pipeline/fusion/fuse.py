@@ -26,6 +26,7 @@ from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.consensus.colors import ColorMap, TeamColors, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import Pairs, tracks
+from duagc.pipeline.consensus.matching import Tracks as FoundTracks
 from duagc.pipeline.fusion.association import EvidenceRows, TrackMembers, fused_moves
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces, select_unseen
@@ -40,6 +41,7 @@ from duagc.pipeline.splat.information import (
     OPACITY,
     THETA_SIZE,
     gaussians_of,
+    mean_block,
 )
 
 Index = NDArray[np.int64]
@@ -212,10 +214,12 @@ def fuse(
     ids = own.gaussians.ids
     ordered = {n: _in_order_of(ids, e) if n == own.robot else e for n, e in evidence.items()}
     team = _TeamEvidence.of(own.robot, ordered, pairs, context)
-    matched = _fuse_tracks(team, pairs, _in_order_of(ids, self_information), context)
-    absorbed = matched.absorbed.copy()
+    refused = np.zeros(len(team.theta), dtype=bool)
     for name, against in (contradicted or {}).items():
-        absorbed[team.start[team.names.index(name)] + np.flatnonzero(against)] = True
+        refused[team.start[team.names.index(name)] + np.flatnonzero(against)] = True
+    found = _tracks(team, pairs, context, refused)
+    matched = _fuse_tracks(team, found, _in_order_of(ids, self_information), context)
+    absorbed = matched.absorbed | refused
     moved = own.in_world()
     added = np.flatnonzero((team.owner != team.names.index(team.robot)) & ~absorbed)
     if context.config.coverage == "all" and len(added):
@@ -233,16 +237,38 @@ def fuse(
     return _fused_map(team, matched, moved, added)
 
 
-def _fuse_tracks(
-    team: _TeamEvidence, pairs: Pairs, self_information: Evidence, context: MapContext
-) -> _Tracks:
-    """Fuse all tracks; the receiver's row stands for a track, else that of the robot of the lowest name."""
-    me = team.names.index(team.robot)
+def _tracks(
+    team: _TeamEvidence, pairs: Pairs, context: MapContext, refused: NDArray[np.bool_]
+) -> FoundTracks:
+    """All tracks; refused rows [rows] take part only in those of the receiver, and leave the others what they saw."""
     found = tracks(team.evidence, pairs, context.matching)
+    own = np.zeros(len(np.unique(found.track)), dtype=bool)
+    own[found.track[found.robot == team.names.index(team.robot)]] = True
+    leaves = refused[team.start[found.robot] + found.row] & ~own[found.track]
+    if not leaves.any():
+        return found
+    gone = {
+        name: team.evidence[name].ids[found.row[leaves & (found.robot == k)]]
+        for k, name in enumerate(team.names)
+    }
+    kept = {
+        (a, b): ids[~(np.isin(ids[:, 0], gone[a]) | np.isin(ids[:, 1], gone[b]))]
+        for (a, b), ids in pairs.items()
+        if a in gone and b in gone
+    }
+    return tracks(team.evidence, kept, context.matching)
+
+
+def _fuse_tracks(
+    team: _TeamEvidence, found: FoundTracks, self_information: Evidence, context: MapContext
+) -> _Tracks:
+    """Fuse all tracks; the receiver's row stands for a track, else that which knows its position best."""
+    me = team.names.index(team.robot)
     member = team.start[found.robot] + found.row
     first = np.flatnonzero(np.diff(found.track, prepend=-1)).astype(np.int64)
     track_of_member = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(member))))
-    reference = first.copy()
+    known = np.trace(mean_block(team.information[member]), axis1=-2, axis2=-1)
+    reference = np.lexsort((np.arange(len(member)), -known, track_of_member))[first]
     reference[track_of_member[found.robot == me]] = np.flatnonzero(found.robot == me)
     representative = member[reference]
 

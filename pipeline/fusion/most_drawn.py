@@ -74,8 +74,12 @@ def _others(
         e = evidence[name]
         taken = [fused.source_ids[fused.source == fused.robots.index(name)]]
         for (lower, higher), ids in pairs.items():
-            if name == higher or (name == lower and higher == robot):
-                taken.append(ids[:, 0 if name == lower else 1])
+            if name == lower and higher == robot:
+                taken.append(ids[:, 0])
+            elif name == higher and lower == robot:
+                taken.append(ids[:, 1])
+            elif name == higher and lower in evidence:
+                taken.append(ids[np.isin(ids[:, 0], evidence[lower].ids), 1])
         new = ~np.isin(e.ids, np.concatenate(taken))
         if context.config.added_need_information:
             new &= np.trace(mean_block(e.information), axis1=-2, axis2=-1) > 0

@@ -1,5 +1,7 @@
 """What a robot imports from its neighbors: what its own keyframes and its own map do not explain, once."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from duagc.pipeline.config.fusion import FusionConfig
@@ -138,6 +140,8 @@ def test_a_surface_that_the_own_map_hardly_draws_is_not_explained():
 def test_what_two_neighbors_share_is_imported_once():
     world = World(14)
     pair = {("bravo", "charlie"): world.pairs["bravo", "charlie"]}
+    known = world.evidence["bravo"]
+    world.evidence["bravo"] = replace(known, information=100 * known.information)
     found = world.fuse("alpha", pairs=pair)  # bravo's, with what charlie says about them
     assert (found.matched, found.added) == (0, N)
     assert [found.robots[s] for s in found.source[N:]] == ["bravo"] * N

@@ -88,6 +88,16 @@ def test_what_the_fused_map_stands_for_does_not_come_again():
     assert np.sum(once.means[:, 0] > 0) == len(right), "matched peers' Gaussians count once"
 
 
+@pytest.mark.parametrize("missing", ["bravo", "charlie"])
+def test_what_is_not_here_takes_nothing_else_out(missing):
+    """Nothing is here of one of two peers that are matched with each other: own images contradict it."""
+    right = wall(2.0, across_m=0.6)
+    both = np.stack([np.arange(64), np.arange(64)], axis=1)
+    peers = {name: right.select(slice(0, 0 if name == missing else None)) for name in ("bravo", "charlie")}
+    found = start(wall(2.0), peers, pairs={("bravo", "charlie"): both}, most=1000)
+    assert np.sum(found.means[:, 0] > 0) == np.sum(start(wall(2.0), {"bravo": right}).means[:, 0] > 0) > 0
+
+
 @pytest.mark.parametrize("most", [50, 1000])
 def test_the_map_is_no_larger_than_allowed(most):
     found = start(wall(2.0), {"bravo": wall(2.0, across_m=0.6)}, most=most)
