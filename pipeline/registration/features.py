@@ -19,7 +19,7 @@ from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 Descriptors = NDArray[np.uint8]
 DIMENSIONS = 128
-MIN_WIDTH_PX = 240  # of the image that features are looked for in
+LEAST_PX = 50_000  # of the image that features are looked for in
 DARK, DARK_PERCENT = 100, 99  # gray value that one pixel in a hundred of a well exposed image exceeds
 SCALE = 512.0  # RootSIFT entries are at most 1 and mostly below 0.5; larger ones saturate at one byte
 
@@ -119,7 +119,7 @@ def brightened(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> Features:
     """`extract` from the finest image of a pyramid that is not wider than a limit, or the coarsest if all are.
 
-    An image of less than `MIN_WIDTH_PX` shows too little: then the next finer one is taken, if there is one.
+    An image of less than `LEAST_PX` pixels shows too little: then the next finer one is taken, if there is one.
 
     Args:
         pyramid: of the view.
@@ -128,7 +128,8 @@ def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> 
     """
     levels = pyramid.levels
     at = next((k for k, of in enumerate(levels) if of.camera.width <= max_width_px), len(levels) - 1)
-    level = levels[at - 1 if at and levels[at].camera.width < MIN_WIDTH_PX else at]
+    small = levels[at].camera.width * levels[at].camera.height < LEAST_PX
+    level = levels[at - 1 if at and small else at]
     gray = np.rint(np.clip(level.gray, 0, 1) * 255).astype(np.uint8)
     known = level.inverse_depth > 0
     depth_m = np.where(known, 1 / np.where(known, level.inverse_depth, 1), 0).astype(np.float32)

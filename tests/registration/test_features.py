@@ -43,9 +43,23 @@ def test_only_dark_images_are_brightened() -> None:
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "level"), [(640, 480, 1), (848, 480, 1), (424, 240, 0), (1280, 720, 2), (160, 120, 0)]
+    ("width", "height", "level"),
+    [
+        (640, 480, 1),
+        (848, 480, 1),
+        (424, 240, 0),
+        (1280, 720, 2),
+        (752, 480, 1),
+        (480, 640, 1),
+        (240, 180, 0),
+        (160, 120, 0),
+        (960, 540, 1),
+        (1920, 1080, 2),
+        (1226, 370, 1),
+        (480, 360, 0),
+    ],
 )
-def test_features_come_from_an_image_of_240_to_425_columns(width: int, height: int, level: int) -> None:
+def test_features_come_from_an_image_that_shows_enough(width: int, height: int, level: int) -> None:
     gray = cv2.resize(blobs().astype(np.float32) / 255, (width, height), interpolation=cv2.INTER_CUBIC)
     camera = PinholeCamera(width, height, width, width, width / 2 - 0.5, height / 2 - 0.5)
     pyramid = RgbdPyramid.build(np.clip(gray, 0, 1), np.full((height, width), 2.0, np.float32), camera, 4)
