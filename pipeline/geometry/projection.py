@@ -15,6 +15,7 @@ Indices = NDArray[np.int64]
 Image = NDArray[np.floating]
 
 NEAR_M = 0.05  # points nearer to the image plane are not projected: their pixels mean little
+NEAR_GATE = 0.25  # of the depth: gates in meters of near surfaces are no larger
 SAME_SURFACE = 0.1  # relative difference of depth up to which two views show the same surface
 
 FREE, ON_SURFACE, HIDDEN = 1, 0, -1  # where a point is as a view saw it: see `free_space`
@@ -108,7 +109,8 @@ def free_space(
         points_camera: [n, 3], meters, in the frame of the view.
         nearest: [h, w], `largest_of_3x3` of the view's inverse depth, 1/m, 0 = unknown.
         camera: of the view.
-        gate_m: a point must differ by this from the measured depth not to be on the surface.
+        gate_m: a point must differ by this from the measured depth not to be on the surface; less of surfaces that
+            are so near that it is more than a quarter of their depth.
         gate_relative: the same as a share of the measured depth; the larger limit holds.
 
     Returns:
@@ -118,7 +120,7 @@ def free_space(
     inverse = nearest[v, u]
     index, inverse = index[inverse > 0], inverse[inverse > 0]
     z_view, z_point = 1 / inverse.astype(np.float64), points_camera[index, 2]
-    gate = np.maximum(gate_m, gate_relative * z_view)
+    gate = np.maximum(np.minimum(gate_m, NEAR_GATE * z_view), gate_relative * z_view)
     where = np.where(z_point < z_view - gate, FREE, np.where(z_point > z_view + gate, HIDDEN, ON_SURFACE))
     return index, where.astype(np.int8)
 

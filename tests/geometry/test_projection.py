@@ -45,6 +45,17 @@ def test_visible_points_are_before_the_camera_and_inside_the_image() -> None:
     assert v.max() < 27
 
 
+@pytest.mark.parametrize("z", [0.25, 0.4, 0.8, 2.0])
+def test_what_stands_before_a_surface_is_in_free_space_however_near_it_is(z: float) -> None:
+    """A hand at 60 % of the distance, as a wall is seen from 25 cm or from 2 m."""
+    nearest = projection.largest_of_3x3(1 / wall(z))
+    for share, expected in ((0.6, projection.FREE), (1.0, projection.ON_SURFACE), (1.4, projection.HIDDEN)):
+        points = points_of(wall(share * z))
+        index, where = projection.free_space(points, nearest, CAMERA, gate_m=0.15, gate_relative=0.1)
+        assert len(index) == len(points)
+        assert (where == expected).all()
+
+
 def test_nothing_is_visible_of_no_points() -> None:
     assert all(len(part) == 0 for part in projection.visible(CAMERA, np.zeros((0, 3))))
     assert projection.overlap(np.zeros((0, 3)), CAMERA, depth_m=wall(1)) == 0.0
