@@ -18,6 +18,7 @@ FEWEST = 10  # turns that a correction needs
 MOST = 60  # last turns that are compared
 REMOUNTED = 0.5  # of the deviation without it, at most, with a mounting that is estimated
 KEPT = 0.9  # of the turns: what frames were registered wrongly is left out
+STILL_SIGMAS = 3.0  # of a stated rate: slower turns tell no more of the mounting
 LEAST_SPREAD = 0.2  # of the second direction of the rates, by the first: they tell the mounting from there on
 
 
@@ -53,6 +54,16 @@ class GyroCorrection:
             elapsed_s: the time.
         """
         return np.asarray(so3.exp(self.R_camera_gyro @ so3.log(R) - self.bias * elapsed_s))
+
+    def is_still(self, turn: Turn, stated_sigma: float) -> bool:
+        """Whether neither sensor saw more of a turn than noise.
+
+        Args:
+            turn: between two frames.
+            stated_sigma: standard deviation of a rate that is expected, rad/s.
+        """
+        rates = self.R_camera_gyro @ turn.by_gyro - self.bias, turn.by_images
+        return all(float(np.linalg.norm(rate)) < STILL_SIGMAS * stated_sigma for rate in rates)
 
     @staticmethod
     def of(turns: Sequence[Turn], stated_sigma: float) -> GyroCorrection:

@@ -19,7 +19,7 @@ from duagc.pipeline.frontend.failure import (
     Reason,
     Viewpoint,
 )
-from duagc.pipeline.frontend.gyro_calibration import MOST, GyroCorrection, Turn
+from duagc.pipeline.frontend.gyro_calibration import FEWEST, MOST, GyroCorrection, Turn
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -245,8 +245,11 @@ class TrackingState:
         if motion is None or motion.knows_translation or elapsed_s <= 0:
             return
         turn = Turn(so3.log(motion.T_start_stop[:3, :3]) / elapsed_s, so3.log(R_last_camera) / elapsed_s)
+        stated_sigma = self._stated_gyro_sigma_rad(elapsed_s) / elapsed_s
+        if len(self.turns) >= FEWEST and self.gyro.is_still(turn, stated_sigma):
+            return  # a pause would push out the turns that tell how it is mounted
         self.turns = [*self.turns[1 - MOST :], turn]
-        self.gyro = GyroCorrection.of(self.turns, self._stated_gyro_sigma_rad(elapsed_s) / elapsed_s)
+        self.gyro = GyroCorrection.of(self.turns, stated_sigma)
 
     def _deviation_px(self, elapsed_s: float, *, turns: bool) -> float:
         """By how much acceleration moves a view off its prediction, pixels of the coarsest image of a registration."""

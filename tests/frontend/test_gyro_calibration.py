@@ -1,5 +1,7 @@
 """A gyroscope with a bias, mounted otherwise than the log says, or in other units, against what the images say."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,32 @@ def test_few_turns_correct_nothing() -> None:
     found = GyroCorrection.of(turns(FEWEST - 1, gyro=lambda rate: rate + BIAS), STATED)
     assert found.helps
     assert not found.bias.any()
+
+
+def test_turns_that_neither_sensor_sees_are_still() -> None:
+    known = GyroCorrection(MOUNTED, BIAS, 0.01)
+    noise = np.array([0.02, -0.01, 0.01])
+    still = Turn(MOUNTED.T @ (BIAS + noise), noise)
+    assert known.is_still(still, STATED)
+    assert not known.is_still(Turn(still.by_gyro, np.array([0.1, 0, 0])), STATED)
+    assert not known.is_still(Turn(MOUNTED.T @ (BIAS + np.array([0.1, 0, 0])), noise), STATED)
+
+
+def test_a_pause_does_not_make_the_mounting_forgotten() -> None:
+    state = Tracker(CAMERA, FrontendConfig()).state
+    moving = turns(90, gyro=lambda rate: MOUNTED.T @ (rate + BIAS))
+    rng = np.random.default_rng(1)
+    noise = [0.01 * rng.standard_normal((2, 3)) for _ in range(90)]
+    still = [Turn(MOUNTED.T @ (BIAS + by_gyro), by_images) for by_gyro, by_images in noise]
+    steps = iter([*moving, *still])
+    for _ in range(180):
+        turn = next(steps)
+        rotation = so3.exp(turn.by_gyro / 30)
+        T = se3.from_rotation_translation(rotation, np.zeros(3))
+        state.motion = SimpleNamespace(between=lambda *_, T=T: Motion(T, knows_translation=False))
+        state.compare_gyro(state.stamp_ns + 33_333_333, so3.exp(turn.by_images / 30))
+    np.testing.assert_allclose(state.gyro.R_camera_gyro, MOUNTED, atol=0.05)
+    np.testing.assert_allclose(state.gyro.bias, BIAS, atol=0.02)
 
 
 class Gyro:
