@@ -23,6 +23,7 @@ from duagc.pipeline.registration import (
     RgbdPyramid,
     register,
 )
+from duagc.pipeline.registration.align import reach_factor
 
 OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m is no knowledge
 
@@ -46,6 +47,12 @@ class LastGoodFrame:
     @cached_property
     def _reference(self) -> Reference:
         return Reference.from_pyramid(self.pyramid, self.strides)
+
+    @cached_property
+    def _depth_m(self) -> float:
+        """Median depth of the samples."""
+        points = next((of.points for of in reversed(self._reference.levels) if len(of)), np.zeros((1, 3)))
+        return float(np.median(points[:, 2]))
 
     def register_color(
         self,
@@ -80,7 +87,8 @@ class LastGoodFrame:
         T = result.T_reference_target
         translation_m = float(np.linalg.norm(T[:3, 3]))
         outcome = result.outcome
-        if result.ok and translation_m > limits.max_translation_without_depth_m:
+        farthest_m = limits.max_translation_without_depth_m * reach_factor(self._depth_m)
+        if result.ok and translation_m > farthest_m:
             outcome = Outcome.JUMP
         elif result.ok and result.view < limits.min_view_without_depth:
             outcome = Outcome.LOW_OVERLAP
@@ -122,8 +130,7 @@ class LastGoodFrame:
 
     def _information(self, result: Registration, sigma_m: float) -> Array:
         """Of the pose in the keyframe: covariances of registration, of this frame's pose and of the translation add."""
-        points = next((of.points for of in reversed(self._reference.levels) if len(of)), np.zeros((1, 3)))
-        depth_m = max(float(np.median(points[:, 2])), 0.1)
+        depth_m = max(self._depth_m, 0.1)
         covariance = _covariance(result.information)
         covariance += sigma_m**2 * np.diag([1.0, 1.0, 1.0, *[depth_m**-2.0] * 3])
         if self.information is not None:

@@ -16,8 +16,10 @@ from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.pose_checks import PLAUSIBLE, verify
 from duagc.pipeline.frontend.stable_registration import register_until_stable
+from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.geometric_verification import motion_from_features
 from duagc.pipeline.registration.place_index import PlaceIndex
@@ -105,11 +107,23 @@ class Relocalizer:
         self._unconfirmed = _Unconfirmed(place, frame.stamp_ns, 0)
         return Reason.UNCONFIRMED
 
+    def alike(self, state: TrackingState, frame: CurrentFrame) -> list[TrackedKeyframe]:
+        """Keyframes that may show what a frame shows.
+
+        Args:
+            state: what the tracker knows.
+            frame: the frame.
+        """
+        return [state.keyframes[index] for index in self._alike(state, frame)]
+
     def _find(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | None:
         """The place of a frame among all keyframes."""
+        return find_place(state, frame, self._alike(state, frame))
+
+    def _alike(self, state: TrackingState, frame: CurrentFrame) -> list[int]:
         for keyframe in state.keyframes[len(self._index) :]:
             self._index.add(keyframe.features.descriptors)
-        return find_place(state, frame, self._index.alike(frame.features.descriptors))
+        return self._index.alike(frame.features.descriptors)
 
     def _confirm(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason | None:
         """Track on from a place that was found; None if the frame does not agree with it."""
@@ -117,7 +131,9 @@ class Relocalizer:
         before, self._unconfirmed = self._unconfirmed, None
         index, last = before.candidate.keyframe_index, before.candidate.result.T_reference_target
         tracking = state.config.tracking
-        reach_m = tracking.failure.max_speed_m_s * (frame.stamp_ns - before.stamp_ns) * 1e-9
+        elapsed_s = (frame.stamp_ns - before.stamp_ns) * 1e-9
+        reach_m = tracking.failure.max_speed_m_s * elapsed_s
+        reach_m *= reach_factor(state.keyframes[index].median_depth_m)
         candidate = None
         for start in _starts(state, frame, index, last):
             result = register_until_stable(

@@ -166,7 +166,7 @@ class SubmapTracker:
         view = frame.features.descriptors[:most]
         return any(
             len(matches(keyframe.features.descriptors[:most], view, ratio)) >= limits.min_matches
-            for keyframe in tracker.keyframes
+            for keyframe in tracker.alike(frame)
             if len(keyframe.features)
         )
 

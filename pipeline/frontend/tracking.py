@@ -72,6 +72,14 @@ class Tracker:
         """Registrations between keyframes, for `keyframe_graph.solve_pose_graph`."""
         return self.state.pairs
 
+    def alike(self, frame: CurrentFrame) -> list[TrackedKeyframe]:
+        """Keyframes that may show what a frame shows: all of few, else those that share most rare words with it.
+
+        Args:
+            frame: the frame.
+        """
+        return self._relocalizer.alike(self.state, frame)
+
     def copied(self, config: FrontendConfig | None = None) -> Tracker:
         """A tracker that goes on from the same state, independently of this one.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from duagc.pipeline.experiments.disturbances import Shot
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
+from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.stage import component_path, run_frontend
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
@@ -223,3 +225,15 @@ def test_what_moves_with_the_camera_is_no_submap(walk) -> None:
     log = tracked(shots)
     assert len(log.submaps) == 1
     assert all(frame.status is Status.LOST for frame in log.frames[21:])
+
+
+def test_a_lost_frame_is_compared_with_few_keyframes_of_a_long_submap() -> None:
+    rng = np.random.default_rng(0)
+    views = [rng.integers(0, 256, (60, 128)).astype(np.uint8) for _ in range(150)]
+    keyframes = [
+        SimpleNamespace(number=k, features=SimpleNamespace(descriptors=v)) for k, v in enumerate(views)
+    ]
+    frame = SimpleNamespace(features=SimpleNamespace(descriptors=views[97]))
+    found = Relocalizer().alike(SimpleNamespace(keyframes=keyframes), frame)
+    assert len(found) <= 64
+    assert 97 in [keyframe.number for keyframe in found]
