@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,17 @@ from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
 
 NAME = "session.npz"
 SCHEMA = 2
+_DAMAGE = (  # what reading a damaged file raises; RuntimeError: a flag or a method that zipfile does not know
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RuntimeError,
+)
 _FAST = 1  # level of the compression: evidence is noise for the most part
 
 
@@ -76,8 +88,10 @@ def read_session_result(path: Path) -> SessionResult:
             if plain["schema"] != SCHEMA:
                 raise DuagError(f"{path}: schema is {plain['schema']}, expected {SCHEMA}")
             return _result(plain, _Reader(file, plain["types"]))
-    except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError) as error:
-        raise DuagError(f"{path}: {error}, expected the result of a session") from error
+    except _DAMAGE as error:
+        raise DuagError(
+            f"{path}: {str(error) or 'ends too early'}, expected the result of a session"
+        ) from error
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """What a robot takes home from a session reads back bit for bit."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -93,3 +94,25 @@ def test_a_damaged_one_is_one_line(tmp_path: Path) -> None:
         path.write_bytes(damaged)
         with pytest.raises(DuagError, match=r"session\.npz: .*expected the result of a session"):
             read_session_result(path)
+
+
+def test_no_changed_byte_ends_in_another_error(tmp_path: Path) -> None:
+    path = tmp_path / "session.npz"
+    write_session_result(path, result())
+    content = path.read_bytes()
+    directory = content.index(b"PK\x01\x02")
+    for at in [*range(26, 60, 3), *range(directory - 2, directory + 60)]:
+        path.write_bytes(content[:at] + bytes([content[at] ^ 0xFF]) + content[at + 1 :])
+        found = outcome(path)
+        if isinstance(found, str):
+            assert re.fullmatch(r".*session\.npz: \S.*, expected .+", found)
+        else:  # of a name or a time that nothing depends on
+            same(found, result())
+
+
+def outcome(path: Path) -> SessionResult | str:
+    """What is read, or the line of the error."""
+    try:
+        return read_session_result(path)
+    except DuagError as error:
+        return str(error)
