@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.exchange import EvidenceOrder
 from duagc.pipeline.consensus.evidence import Evidence
@@ -29,10 +30,21 @@ VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
 
 
 def own_records(data: RobotData, kind: Kind, weights: WeightKind) -> Records:
-    """A robot's own evidence in the frames of its anchors, in the precision of this kind of evidence."""
+    """A robot's own evidence in the frames of its anchors, in the precision of this kind of evidence.
+
+    Raises:
+        DuagError: some of it is not finite; integers of the compact kind cannot say so.
+    """
     evidence = shared_evidence(
         data.robot, data.gaussians, data.information, data.T_map_keyframe, kind=weights
     )
+    for name, values in (("parameters", evidence.theta), ("information", evidence.information)):
+        broken = len(values) - int(np.isfinite(values).all(axis=1).sum())
+        if broken:
+            raise DuagError(
+                f"{data.robot}: {name} of {broken} of {len(values)} Gaussians of its map are not finite, expected "
+                "finite numbers"
+            )
     return to_records(evidence, kind)
 
 
