@@ -47,9 +47,9 @@ def read_bytes(path: Path, expected: str) -> bytes:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """The text of a file in UTF-8. Raises DuagError as `check_file` does."""
+    """The text of a file in UTF-8, without a byte order mark. Raises DuagError as `check_file` does."""
     try:
-        return read_bytes(path, expected).decode()
+        return read_bytes(path, expected).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DuagError(f"{path}: is not text, expected {expected}") from error
 

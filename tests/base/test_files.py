@@ -1,0 +1,22 @@
+"""Text of files from outside."""
+
+from pathlib import Path
+
+import pytest
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"], ids=["plain", "byte order mark"])
+def test_a_byte_order_mark_is_no_text(mark: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "list.txt"
+    path.write_bytes(mark + "1.0 rgb/ä.png\n".encode())
+    assert read_text(path, "a list") == "1.0 rgb/ä.png\n"
+
+
+def test_what_is_no_text_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "list.txt"
+    path.write_bytes(b"\xff\xfe1\0")
+    with pytest.raises(DuagError, match=r"list\.txt: is not text, expected a list"):
+        read_text(path, "a list")
