@@ -154,11 +154,11 @@ class Poses:
 
     @staticmethod
     def read(path: Path) -> Poses:
-        """From `timestamp tx ty tz qx qy qz qw`; lines with nan are counted and left out."""
+        """From `timestamp tx ty tz qx qy qz qw`, also with commas; lines with nan are counted and left out."""
         rows: dict[int, list[float]] = {}
         unusable = 0
         for number, line in enumerate(read_text(path, "lines of time and pose").splitlines(), start=1):
-            words = line.split()
+            words = line.replace(",", " ").split()
             if not words or words[0].startswith("#"):
                 continue
             where = f"{path}:{number}"

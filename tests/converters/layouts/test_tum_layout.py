@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from duagc.converters.layouts.tum_layout import AssociationOptions, Listed, associate
+from duagc.converters.layouts.tum_layout import AssociationOptions, Listed, Poses, associate, read_list
 
 
 def listed(times: list[int]) -> list[Listed]:
@@ -26,3 +26,20 @@ def test_every_image_has_the_nearest_depth(association: str, seed: int) -> None:
 
 def test_where_there_is_no_depth_there_is_no_pair() -> None:
     assert associate(listed([1, 2]), [], AssociationOptions()) == []
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff"], ids=["plain", "byte order mark"])
+def test_lists_may_begin_with_a_byte_order_mark(mark: str, tmp_path: Path) -> None:
+    path = tmp_path / "rgb.txt"
+    path.write_text(f"{mark}1.5 rgb/0.png\n2.5 rgb/1.png\n", encoding="utf-8")
+    assert [entry.stamp_ns for entry in read_list(path)] == [1_500_000_000, 2_500_000_000]
+
+
+@pytest.mark.parametrize("between", [" ", ",", ", ", "\t"])
+def test_numbers_of_poses_are_separated_by_spaces_or_commas(between: str, tmp_path: Path) -> None:
+    path = tmp_path / "truth.txt"
+    rows = [["1.000000001", "1", "2", "3", "0", "0", "0", "1"], ["2.5", "4", "5", "6", "0", "0", "1", "0"]]
+    path.write_text("".join(between.join(row) + "\n" for row in rows))
+    poses = Poses.read(path)
+    assert poses.stamps_ns.tolist() == [1_000_000_001, 2_500_000_000]
+    np.testing.assert_array_equal(poses.T_world_body[:, :3, 3], [[1, 2, 3], [4, 5, 6]])
