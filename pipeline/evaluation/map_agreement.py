@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ def section(
 ) -> dict[str, Any]:
     """How well held-out views agree under trajectories, and under the ground truth where there is one.
 
+    Ground truth of a part of the views takes no view from the trajectories, which need none.
+
     Args:
         log_path: sensor log of the robot.
         held_out: stamp of every held-out frame that was tracked, by its index.
@@ -44,12 +47,30 @@ def section(
         `depth_agreement_m` and `feature_agreement_px` of every path, and of how many pairs of views.
     """
     found: dict[str, Any] = {}
+    own = [i for i, stamp in held_out.items() if all(stamp in path for path in paths.values())]
+    with_truth, judged = own, dict(paths)
     if isinstance(true, Absent) or true.positions_only:
         absent = true if isinstance(true, Absent) else NO_ROTATIONS
         found = {f"depth_agreement_m{OF_TRUTH}": absent, f"feature_agreement_px{OF_TRUTH}": absent}
     else:
-        paths = {**paths, OF_TRUTH: dict(zip(true.stamps_ns.tolist(), true.true, strict=True))}
-    known = [i for i, stamp in held_out.items() if all(stamp in path for path in paths.values())]
+        of_truth = dict(zip(true.stamps_ns.tolist(), true.true, strict=True))
+        with_truth, judged = [i for i in own if held_out[i] in of_truth], {**paths, OF_TRUTH: of_truth}
+    views = partial(_views, log_path, held_out, frontend=frontend)
+    if with_truth == own:
+        return found | views(own, judged)
+    truth_only = views(with_truth, judged)  # on the views that have some; it takes none from the others
+    return views(own, paths) | {name: value for name, value in truth_only.items() if name.endswith(OF_TRUTH)}
+
+
+def _views(
+    log_path: Path,
+    held_out: Mapping[int, int],
+    known: Sequence[int],
+    paths: Mapping[str, Path3D],
+    *,
+    frontend: Path,
+) -> dict[str, Any]:
+    """Agreement under every path of some of the held-out frames `known`, and of how many pairs."""
     most = min(VIEWS, len(known))
     chosen = [known[k] for k in evenly_spaced(len(known), most)]
     with open_rgbd(log_path) as log:
@@ -63,7 +84,7 @@ def section(
     pairs, by_depth = depth_agreement(depths, camera, poses)
     colors, usable = [f.color for f in frames], [f.mask for f in frames]
     matched, by_features = feature_agreement(colors, depths, camera, poses, masks=usable)
-    found |= {"depth_agreement_pairs": pairs, "feature_agreement_pairs": matched}
+    found: dict[str, Any] = {"depth_agreement_pairs": pairs, "feature_agreement_pairs": matched}
     for name in paths:
         found[f"depth_agreement_m{name}"] = by_depth[name]
         found[f"feature_agreement_px{name}"] = by_features[name]
