@@ -28,6 +28,7 @@ _IGNORED_TAGS = {
 MAX_TRANSLATION_M = 1e6  # as far as robots can tell each other
 WEIGHTS = (1e-18, 1e18)  # of the information and of kappa and tau
 QUATERNION_NORMS = (1e-3, 1e3)
+_SINGULAR = 1e-13  # least eigenvalue of a block by its greatest, each direction scaled to one
 
 Key = tuple[str, int]
 """Robot (or "" before a graph is cut), index."""
@@ -88,8 +89,16 @@ def read_g2o(path: Path) -> Edges:
             raise DuagError(
                 f"{path}: line {number} is not an edge: 2 keys of 64 bits and 28 finite numbers expected"
             )
-        i.append(_symbol(keys[0]))
-        j.append(_symbol(keys[1]))
+        ends = [_symbol(key) for key in keys]
+        _check_ends(path, number, ends[0], ends[1])
+        named = [end[0] for end in (*i[:1], *ends) if end[0]]  # names of robots
+        if named and len(named) < len(ends) + len(i[:1]):
+            raise DuagError(
+                f"{path}: line {number}: found keys {keys[0]} and {keys[1]}, expected all keys of the file plain "
+                f"or all of them gtsam symbols, which name their robot"
+            )
+        i.append(ends[0])
+        j.append(ends[1])
         rows.append(row)
         lines.append(number)
     if not rows:
@@ -101,7 +110,7 @@ def read_g2o(path: Path) -> Edges:
     diagonal = upper[:, np.equal(*np.triu_indices(6))]
     positive = np.where(diagonal > 0, diagonal, np.inf).min(axis=1)  # others are refused for their sign
     _check(path, lines, "information", np.where(np.isinf(positive), 1.0, positive), limits=WEIGHTS)
-    kappa, tau = _isotropic(upper, path)
+    kappa, tau = _isotropic(upper, path, lines)
     _check(path, lines, "kappa", kappa, limits=WEIGHTS)
     _check(path, lines, "tau", tau, limits=WEIGHTS)
     return Edges(i, j, se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3]), kappa, tau)
@@ -128,16 +137,29 @@ def _symbol(key: int) -> Key:
     return (chr(character), key & ((1 << SYMBOL_BITS) - 1)) if character else ("", key)
 
 
-def _isotropic(upper: Array, path: Path) -> tuple[Array, Array]:
+def _check_ends(path: Path, number: int, i: Key, j: Key) -> None:
+    """Refuse an edge from a pose to itself: it says nothing, and no graph has a place for it."""
+    if i == j:
+        raise DuagError(
+            f"{path}: line {number} is an edge from pose {i[1]} to itself, expected an edge between two poses"
+        )
+
+
+def _isotropic(upper: Array, path: Path, lines: list[int]) -> tuple[Array, Array]:
     """SE-Sync's kappa and tau [m] from the upper triangles [m, 21] of the information matrices."""
     at = np.triu_indices(6)
     full = np.zeros((len(upper), 6, 6))
     full[:, at[0], at[1]] = full[:, at[1], at[0]] = upper
     for block in (full[:, :3, :3], full[:, 3:, 3:]):
-        bad = np.linalg.eigvalsh(block)[:, 0] <= 0
+        diagonal = np.diagonal(block, axis1=1, axis2=2)
+        root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        values = np.linalg.eigvalsh(block / root[:, :, None] / root[:, None, :])
+        bad = ~(values[:, 0] > _SINGULAR * values[:, -1]) | (diagonal <= 0).any(axis=1)
         if bad.any():
+            k = int(np.argmax(bad))
             raise DuagError(
-                f"{path}: the information of edge {int(np.argmax(bad)) + 1} is not positive definite"
+                f"{path}: line {lines[k]}: the information of edge {k + 1} is singular or indefinite, "
+                f"expected positive definite"
             )
     tau = 3 / np.trace(np.linalg.inv(full[:, :3, :3]), axis1=1, axis2=2)
     kappa = 3 / (2 * np.trace(np.linalg.inv(full[:, 3:, 3:]), axis1=1, axis2=2))
@@ -161,7 +183,7 @@ def read_kimera(path: Path) -> Edges:
         "kappa",
         "tau",
     ]
-    reader = csv.DictReader(read_text(path, "a pose graph").splitlines())
+    reader = csv.DictReader(read_text(path, "a pose graph").splitlines(), skipinitialspace=True)
     missing = [name for name in needed if name not in (reader.fieldnames or [])]
     if missing:
         raise DuagError(f"{path}: no column {missing[0]}, expected {', '.join(needed)}")
@@ -179,6 +201,7 @@ def read_kimera(path: Path) -> Edges:
             raise DuagError(f"{path}: line {number} is not a measurement with positive kappa and tau")
         i.append((f"robot{ids[0]}", ids[1]))
         j.append((f"robot{ids[2]}", ids[3]))
+        _check_ends(path, number, i[-1], j[-1])
         rows.append(row)
         lines.append(number)
     if not rows:

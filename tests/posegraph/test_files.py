@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph import least_squares
-from duagc.pipeline.posegraph.edges import read_kimera
+from duagc.pipeline.posegraph.edges import read_g2o, read_kimera
 from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.posegraph.pose_graph import PoseGraph
 from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
@@ -155,6 +156,30 @@ def far_line(x_m: float) -> str:
     return g2o_line(1, 2, se3.from_rotation_translation(np.eye(3), [x_m, 0.0, 0.0]))
 
 
+def information_line(translation: Array) -> str:
+    """An edge with this information of its translation [3, 3]."""
+    information = np.eye(6)
+    information[:3, :3] = translation
+    words = g2o_line(1, 2, np.eye(4)).split()[:10]
+    return " ".join([*words, *(repr(float(x)) for x in information[np.triu_indices(6)])]) + "\n"
+
+
+SINGULAR = np.array([[10.0, 2.0, -16.0], [2.0, 20.0, -6.0], [-16.0, -6.0, 26.0]])  # rank two
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_singular_information_is_refused_and_an_uneven_one_is_not(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    A = rng.integers(-5, 6, (2, 3)) * rng.choice([1.0, 0.5, 0.1, 10.0, 100.0])
+    path = tmp_path / "graph.g2o"
+    path.write_text(FINE + information_line(A.T @ A))
+    with pytest.raises(DuagError, match="line 2: the information"):
+        read_g2o(path)
+    uneven = np.diag(10.0 ** rng.uniform(-8, 8, 3))
+    path.write_text(FINE + information_line(uneven))
+    np.testing.assert_allclose(read_g2o(path).tau[1], 3 / np.trace(np.linalg.inv(uneven)), rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("text", "robots", "words"),
     [
@@ -170,6 +195,19 @@ def far_line(x_m: float) -> str:
         (FINE.replace(IDENTITY, "7e200 0.0 0.0 7e200"), None, ["line 1: quaternion norm", "found 9.9e+200"]),
         (FINE + g2o_line(1, 2, np.eye(4), tau=1e300), None, ["line 2: information", "found 1e+300"]),
         (FINE + g2o_line(1, 2, np.eye(4), kappa=1e-300), None, ["line 2: information", "2e-300", "1e-18"]),
+        (
+            "# two\n" + FINE + information_line(SINGULAR),
+            None,
+            ["line 3: the information of edge 2 is singular"],
+        ),
+        (FINE + information_line(-SINGULAR), None, ["line 2: the information of edge 2"]),
+        (FINE + g2o_line(5, 5, np.eye(4)), None, ["line 2 is an edge from pose 5 to itself", "two poses"]),
+        (
+            FINE + g2o_line(symbol("a", 1), symbol("a", 2), np.eye(4)),
+            None,
+            ["line 2", "all keys of the file plain"],
+        ),
+        (g2o_line(symbol("a", 1), 2, np.eye(4)), None, ["line 1", "all keys of the file plain"]),
         ("EDGE_SE3_PRIOR 0 1\n", None, ["EDGE_SE3_PRIOR"]),
         ("", None, ["no EDGE_SE3:QUAT"]),
         (FINE, 2, ["cannot be cut"]),
@@ -207,6 +245,32 @@ def test_a_folder_without_graphs_is_refused(tmp_path):
         read_team_graph(plain / "0.g2o", 2, only_reference=True)
 
 
+COLUMNS = [
+    "robot_src",
+    "pose_src",
+    "robot_dst",
+    "pose_dst",
+    "qx",
+    "qy",
+    "qz",
+    "qw",
+    "tx",
+    "ty",
+    "tz",
+    "kappa",
+    "tau",
+]
+FINE_ROW = dict.fromkeys(COLUMNS, 0.0) | {"pose_dst": 1, "qw": 1.0, "kappa": KAPPA, "tau": TAU}
+
+
+def write_table(folder, rows, separator=","):
+    """`measurements.csv` of one robot."""
+    lines = [[f"{row[n]:.0f}" if "_" in n else repr(float(row[n])) for n in COLUMNS] for row in rows]
+    path = folder / "measurements.csv"
+    path.write_text("\n".join(separator.join(words) for words in [COLUMNS, *lines]))
+    return path
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -217,16 +281,22 @@ def test_a_folder_without_graphs_is_refused(tmp_path):
     ],
 )
 def test_a_table_with_numbers_that_nobody_computes_with_is_refused(tmp_path, changes, words):
-    names = ["robot_src", "pose_src", "robot_dst", "pose_dst", "qx", "qy", "qz", "qw"]
-    names += ["tx", "ty", "tz", "kappa", "tau"]
-    fine = dict.fromkeys(names, 0.0) | {"pose_dst": 1, "qw": 1.0, "kappa": KAPPA, "tau": TAU}
-    rows = [fine, fine | changes]
-    path = tmp_path / "measurements.csv"
-    lines = [",".join(f"{row[n]:.0f}" if "_" in n else repr(float(row[n])) for n in names) for row in rows]
-    path.write_text("\n".join([",".join(names), *lines]))
+    path = write_table(tmp_path, [FINE_ROW, FINE_ROW | changes])
     with pytest.raises(DuagError) as error:
         read_kimera(path)
     assert f"{path}: line 3: {words}" in str(error.value)
+
+
+def test_a_table_with_spaces_behind_its_commas_is_read(tmp_path):
+    plain, spaced = (read_kimera(write_table(tmp_path, [FINE_ROW], separator)) for separator in (",", ", "))
+    assert (spaced.i, spaced.j) == (plain.i, plain.j)
+    np.testing.assert_array_equal(spaced.T_i_j, plain.T_i_j)
+
+
+def test_a_measurement_from_a_pose_to_itself_is_refused(tmp_path):
+    path = write_table(tmp_path, [FINE_ROW, FINE_ROW | {"pose_dst": 0}])
+    with pytest.raises(DuagError, match="line 3 is an edge from pose 0 to itself, expected"):
+        read_kimera(path)
 
 
 def test_a_team_too_far_apart_to_say_so_ends_in_one_line(tmp_path):
