@@ -91,7 +91,7 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
     Raises:
         DuagError: nothing of the kind is there, a line is not understood, or the graph is two-dimensional.
     """
-    edges, ignored = _read(path)
+    edges, files, ignored = _read(path)
     names = sorted({key[0] for key in (*edges.i, *edges.j)})
     if names == [""]:
         edges, order = _cut(edges, 4 if robots is None else robots, path)
@@ -101,7 +101,7 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
         )
     else:
         order = {(robot, key): at for robot, own in _indices(edges).items() for key, at in own.items()}
-    edges, reference = _with_reference(edges, path)
+    edges, reference = _with_reference(edges, path, files)
     consecutive = _consecutive(edges, order)
     if only_reference:
         if edges.inlier is None:
@@ -111,28 +111,29 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
     return _team(edges, consecutive, reference, ignored, path=path)
 
 
-def _read(path: Path) -> tuple[Edges, tuple[str, ...]]:
-    """Edges of a file or a folder, and the files of it that were not read."""
+def _read(path: Path) -> tuple[Edges, int, tuple[str, ...]]:
+    """Edges of a file or a folder, how many files they are from, and the files of it that were not read."""
     if path.is_file():
-        return _merge([read_g2o(path)]), ()
+        return _merge([read_g2o(path)]), 1, ()
     if not path.is_dir():
         raise DuagError(f"{path}: not found, expected a .g2o file or a folder of a team's pose graphs")
     tables = sorted(path.glob("robot*/measurements.csv"), key=_natural)
     if tables:
-        return _merge([read_kimera(table) for table in tables]), ()
+        return _merge([read_kimera(table) for table in tables]), len(tables), ()
     files = sorted(path.glob("*.g2o"), key=_natural)
     if not files:
         raise DuagError(f"{path}: neither *.g2o nor robot*/measurements.csv in this folder")
     graphs = [read_g2o(file) for file in files]
     if len(files) == 1:
-        return _merge(graphs), ()
+        return _merge(graphs), 1, ()
     plain = [all(key[0] == "" for key in (*g.i, *g.j)) for g in graphs]
     team = [g for g, is_plain in zip(graphs, plain, strict=True) if not is_plain]
     if not team:
         raise DuagError(
             f"{path}: {len(files)} graphs with plain keys; a team's graphs need gtsam symbols as keys"
         )
-    return _merge(team), tuple(f.name for f, is_plain in zip(files, plain, strict=True) if is_plain)
+    ignored = tuple(f.name for f, is_plain in zip(files, plain, strict=True) if is_plain)
+    return _merge(team), len(team), ignored
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -172,42 +173,57 @@ def _cut(edges: Edges, robots: int, path: Path) -> tuple[Edges, dict[Key, int]]:
     return Edges(i, j, edges.T_i_j, edges.kappa, edges.tau, edges.inlier), order
 
 
-def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
+def _with_reference(edges: Edges, path: Path, files: int) -> tuple[Edges, str | None]:
     """Mark what a file next to the graph names as true; for the evaluation only."""
     folder = path if path.is_dir() else path.parent
     found = [folder / name for name in _REFERENCES if (folder / name).is_file()]
     if not found:
         return edges, None
     file = found[0]
-    inlier = np.zeros(len(edges.i), dtype=bool)
-    if file.suffix == ".csv":
-        true = set()
-        head, *lines = read_text(file, "a pose graph").splitlines() or [""]
-        if len(head.split(",")) != 5 or head.replace(",", "").strip().isdecimal():
-            raise DuagError(
-                f"{file}: begins with {head[:60]!r}, expected robot_src,pose_src,robot_dst,pose_dst,inlier"
-            )
-        for line in lines:
-            words = line.split(",")
-            if len(words) != 5 or not all(word.strip().isdecimal() for word in words):
-                raise DuagError(
-                    f"{file}: expected robot_src,pose_src,robot_dst,pose_dst,inlier, found {line!r}"
-                )
-            a, i, b, j, flag = (int(word) for word in words)
-            if flag:
-                true.add(((f"robot{a}", i), (f"robot{b}", j)))
-        inlier[:] = [(a, b) in true for a, b in zip(edges.i, edges.j, strict=True)]
-    else:  # numbers of edges of the only graph, counted from 1 in the order of the file; the rest is odometry
-        false = [
-            int(n) for n in re.findall(r"<outlier_lc_indices>\s*(\d+)\s*<", read_text(file, "a pose graph"))
-        ]
-        if not false or max(false) > len(inlier) or min(false) < 1:
-            raise DuagError(
-                f"{file}: expected <outlier_lc_indices> from 1 to the {len(inlier)} edges of the graph"
-            )
-        inlier[:] = True
-        inlier[np.array(false) - 1] = False
+    inlier = _named_true(edges, file) if file.suffix == ".csv" else _not_numbered(len(edges.i), file, files)
     return Edges(edges.i, edges.j, edges.T_i_j, edges.kappa, edges.tau, inlier), file.name
+
+
+def _named_true(edges: Edges, file: Path) -> NDArray[np.bool_]:
+    """What a reference of Kimera-Multi calls true, bool [m]; it may name an edge from its other end."""
+    named: dict[tuple[Key, Key], bool] = {}
+    head, *lines = read_text(file, "a pose graph").splitlines() or [""]
+    if len(head.split(",")) != 5 or head.replace(",", "").strip().isdecimal():
+        raise DuagError(
+            f"{file}: begins with {head[:60]!r}, expected robot_src,pose_src,robot_dst,pose_dst,inlier"
+        )
+    for line in lines:
+        words = line.split(",")
+        if len(words) != 5 or not all(word.strip().isdecimal() for word in words):
+            raise DuagError(f"{file}: expected robot_src,pose_src,robot_dst,pose_dst,inlier, found {line!r}")
+        a, i, b, j, flag = (int(word) for word in words)
+        ends = (f"robot{a}", i), (f"robot{b}", j)
+        named[ends] = named.get(ends, False) or flag != 0
+    present = {ends for i, j in zip(edges.i, edges.j, strict=True) for ends in ((i, j), (j, i))}
+    looked_for = {ends for ends, true in named.items() if true} or set(named)
+    if looked_for and not looked_for & present:
+        source, target = min(looked_for)
+        raise DuagError(
+            f"{file}: found {len(looked_for)} edges, the first from {source[0]} {source[1]} to {target[0]} "
+            f"{target[1]}, and none is in the graph; expected the reference of this graph"
+        )
+    pairs = zip(edges.i, edges.j, strict=True)
+    return np.array([named.get((i, j), named.get((j, i), False)) for i, j in pairs], dtype=bool)
+
+
+def _not_numbered(count: int, file: Path, files: int) -> NDArray[np.bool_]:
+    """What is left by numbers of false edges of the only file, counted from 1 in its order; odometry included."""
+    if files != 1:
+        raise DuagError(
+            f"{file}: numbers the edges of one file, but {files} were read; expected {_REFERENCES[0]}"
+        )
+    text = read_text(file, "a pose graph")
+    false = [int(n) for n in re.findall(r"<outlier_lc_indices>\s*(\d+)\s*<", text)]
+    if not false or max(false) > count or min(false) < 1:
+        raise DuagError(f"{file}: expected <outlier_lc_indices> from 1 to the {count} edges of the graph")
+    inlier = np.ones(count, dtype=bool)
+    inlier[np.array(false) - 1] = False
+    return inlier
 
 
 def _indices(edges: Edges) -> dict[str, dict[int, int]]:

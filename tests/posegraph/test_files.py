@@ -87,22 +87,29 @@ def test_a_loop_that_alone_holds_a_robot_together_is_trusted(tmp_path):
     assert len(graph.odometry) + len(graph.loops) == len(rows)
 
 
-def test_kimera_tables_with_their_reference(tmp_path):
+def write_kimera(folder):
+    """Tables of two robots, and the edges of both."""
     rows, owner = helix_edges(20), [0] * 10 + [1] * 10
     head = "robot_src,pose_src,robot_dst,pose_dst,qx,qy,qz,qw,tx,ty,tz,kappa,tau,is_known_inlier,weight\n"
     for a in range(2):
-        (tmp_path / f"robot{a}").mkdir()
+        (folder / f"robot{a}").mkdir()
         lines = [head]
         for i, j, T in rows:
             if a in (owner[i], owner[j]):
                 quat = g2o_line(i, j, T).split()[6:10]
                 pose = ",".join([*quat, *(repr(float(x)) for x in T[:3, 3])])
                 lines.append(f"{owner[i]},{i},{owner[j]},{j},{pose},{KAPPA},{TAU},0,0.5\n")
-        (tmp_path / f"robot{a}" / "measurements.csv").write_text("".join(lines))
+        (folder / f"robot{a}" / "measurements.csv").write_text("".join(lines))
+    return rows, owner
+
+
+REFERENCE_HEAD = "robot_src,pose_src,robot_dst,pose_dst,inlier\n"
+
+
+def test_kimera_tables_with_their_reference(tmp_path):
+    rows, owner = write_kimera(tmp_path)
     flags = [f"{owner[i]},{i},{owner[j]},{j},{int(i != 4)}\n" for i, j, _ in rows if j - i > 1]
-    (tmp_path / "reference_inliers.csv").write_text(
-        "robot_src,pose_src,robot_dst,pose_dst,inlier\n" + "".join(flags)
-    )
+    (tmp_path / "reference_inliers.csv").write_text(REFERENCE_HEAD + "".join(flags))
     team, T = read_team_graph(tmp_path), helix(20)
     cost, count = team_cost(team, {"robot0": T[:10], "robot1": T[10:]})
     assert count == len(rows)
@@ -117,6 +124,48 @@ def test_kimera_tables_with_their_reference(tmp_path):
     assert false == [(9, 0), (4, 2)]  # the first is not named by the reference at all
     without = read_team_graph(tmp_path, only_reference=True)
     assert team_cost(without, {"robot0": T[:10], "robot1": T[10:]})[1] == count - 2
+
+
+def truths(team):
+    """What the reference says of every loop and loop closure."""
+    parts = [*team.loops_true.items(), *team.closures_true.items()]
+    return {name: part.tolist() for name, part in parts}
+
+
+def test_a_reference_may_name_an_edge_from_its_other_end(tmp_path):
+    rows, owner = write_kimera(tmp_path)
+    found = []
+    for turned in (False, True):
+        pairs = [((j, i) if turned else (i, j), int(i != 4)) for i, j, _ in rows if j - i > 1]
+        flags = [f"{owner[a]},{a},{owner[b]},{b},{flag}\n" for (a, b), flag in pairs]
+        (tmp_path / "reference_inliers.csv").write_text(REFERENCE_HEAD + "".join(flags))
+        found.append(truths(read_team_graph(tmp_path)))
+    assert found[0] == found[1]
+    assert sum(sum(part) for part in found[1].values()) == len(flags) - 1
+
+
+def test_the_reference_of_another_graph_is_refused(tmp_path):
+    write_kimera(tmp_path)
+    reference = tmp_path / "reference_inliers.csv"
+    for text in ("2,0,3,8,1\n", "2,0,3,8,0\n", "0,0,0,8,0\n2,0,3,8,1\n"):
+        reference.write_text(REFERENCE_HEAD + text)
+        with pytest.raises(
+            DuagError, match=r"reference_inliers.csv: found 1 edges.*robot2 0 to robot3 8.*none"
+        ):
+            read_team_graph(tmp_path)
+    reference.write_text(REFERENCE_HEAD + "0,0,0,8,0\n")  # all false is an answer, and so is nothing
+    assert not any(map(any, truths(read_team_graph(tmp_path)).values()))
+    reference.write_text(REFERENCE_HEAD)
+    assert not any(map(any, truths(read_team_graph(tmp_path)).values()))
+
+
+def test_numbers_of_edges_are_refused_if_several_files_were_read(tmp_path):
+    folder = write_team(tmp_path / "team", helix_edges(24), 2, 24)
+    (folder / "gt_info.xml").write_text("<outlier_lc_indices>3</outlier_lc_indices>\n")
+    with pytest.raises(
+        DuagError, match=r"gt_info.xml: numbers the edges of one file, but 2 were read; expected"
+    ):
+        read_team_graph(folder)
 
 
 def test_edges_that_the_reference_names_false_by_number(tmp_path):
