@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.posegraph import PoseGraphConfig
+from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM
 from duagc.pipeline.network.packets import HEADER_BYTES, MAX_PAYLOAD_BYTES
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.certificate import is_global_minimum
@@ -68,6 +70,8 @@ def solve(
 ) -> dict[str, Any]:
     """Read, cut, let the team solve it, compare; see `docs/howto/pose-graph.md` for the result."""
     graph = read_team_graph(path, robots, only_reference=only_reference)
+    if len(graph.robots) > MAX_TEAM:
+        raise DuagError(f"{path}: found {len(graph.robots)} robots, expected at most {MAX_TEAM}")
     c2 = config.consensus.truncation**2 if config.consensus.robust else None
     components = [_component(graph, members, config) for members in graph.components()]
     if c2 is None:

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.exchange import rounds as session_rounds
 from duagc.pipeline.network.packets import MAX_PACKET_BYTES, parse
@@ -208,6 +209,13 @@ def test_the_command_refuses_in_one_line(tmp_path):
     assert_one_line(duagc_here("posegraph", tmp_path / "absent.g2o"), "absent.g2o", "not found")
     path = write_g2o(tmp_path / "helix.g2o", helix_edges(N))
     assert_one_line(duagc_here("posegraph", path, "--robots", "40"), "48 poses", "40 robots")
+
+
+def test_too_many_robots_are_refused_before_anything_is_solved(tmp_path, monkeypatch):
+    path = write_g2o(tmp_path / "helix.g2o", helix_edges(150))
+    monkeypatch.setattr(solve, "solve_pose_graph", None)
+    with pytest.raises(DuagError, match=r"helix.g2o: found 70 robots, expected at most 64"):
+        solve.solve(path, settings("admm"), 70)
 
 
 def test_a_robot_without_closures_does_not_hide_when_the_others_arrived(tmp_path):
