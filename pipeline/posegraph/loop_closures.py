@@ -20,6 +20,7 @@ from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, 
 CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
 _OTHER_GROUPS = 2  # further than the largest, that a cycle of three robots may find to be the right ones
 _SCALES = 8.0  # of a relative frame, that a placement may be off
+_ROWS = 64  # of pairs of loop closures at a time: bounds the memory
 _CANDIDATES = 150  # relative frames tried as the start of the mean
 
 
@@ -260,17 +261,23 @@ def _cauchy(frames: Array, T: Array, config: LoopClosureConfig) -> Array:
 def _disagreement(frames: Array, points_peermap: Array) -> tuple[Array, Array]:
     """Angle and distance [m, m] between implied frames k and l, the distance at the place of loop closure l."""
     R, t = frames[:, :3, :3], frames[:, :3, 3]
-    # angle of Rk' Rl from its trace's complement: |Rk - Rl|_F = 2 sqrt2 sin(angle / 2)
-    chord = np.sqrt(np.sum((R[:, None] - R[None]) ** 2, axis=(-1, -2)))
-    rotation_rad = 2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0))
     at_own = (R @ points_peermap[..., None])[..., 0] + t
-    at_other = np.einsum("kab,lb->kla", R, points_peermap) + t[:, None]
-    translation_m = np.linalg.norm(at_other - at_own[None], axis=-1)
+    rotation_rad, translation_m = np.empty((len(R), len(R))), np.empty((len(R), len(R)))
+    for k in (slice(first, first + _ROWS) for first in range(0, len(R), _ROWS)):
+        # angle of Rk' Rl from its trace's complement: |Rk - Rl|_F = 2 sqrt2 sin(angle / 2)
+        chord = np.sqrt(np.sum((R[k, None] - R[None]) ** 2, axis=(-1, -2)))
+        rotation_rad[k] = 2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0))
+        at_other = np.einsum("kab,lb->kla", R[k], points_peermap) + t[k, None]
+        translation_m[k] = np.linalg.norm(at_other - at_own[None], axis=-1)
     return rotation_rad, np.minimum(translation_m, translation_m.T)
 
 
 def _distances(points: Array) -> Array:
-    return np.linalg.norm(points[:, None] - points[None], axis=-1)
+    """Distances [m, m] (m) between points [m, 3]."""
+    out = np.empty((len(points), len(points)))
+    for k in (slice(first, first + _ROWS) for first in range(0, len(points), _ROWS)):
+        out[k] = np.linalg.norm(points[k, None] - points[None], axis=-1)
+    return out
 
 
 def _clique(agree: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -281,12 +288,15 @@ def _clique(agree: NDArray[np.bool_]) -> NDArray[np.bool_]:
     for start in np.argsort(-agree.sum(axis=1), kind="stable")[:10].tolist():
         clique, candidates = [start], agree[start].copy()
         candidates[start] = False
+        degrees = agree[:, candidates].sum(axis=1)  # to candidates
         while candidates.any():
             left = np.flatnonzero(candidates)
-            chosen = int(left[np.argmax(agree[np.ix_(left, left)].sum(axis=1))])
+            chosen = int(left[np.argmax(degrees[left])])
             clique.append(chosen)
-            candidates &= agree[chosen]
-            candidates[chosen] = False
+            kept = candidates & agree[chosen]
+            kept[chosen] = False
+            degrees -= agree[:, candidates & ~kept].sum(axis=1)
+            candidates = kept
         if len(clique) > len(best):
             best = clique
     keep = np.zeros(len(agree), dtype=bool)

@@ -1,10 +1,13 @@
 """Closures of a pair: who agrees, on which frame, who holds them, and how frames chain."""
 
+import time
+import tracemalloc
+
 import numpy as np
 
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph import least_squares, loop_closures
 from duagc.pipeline.posegraph.loop_closures import (
     KeyframePoses,
     consistent,
@@ -130,6 +133,50 @@ def test_a_closure_says_the_same_from_both_ends():
     again = back.reversed()
     np.testing.assert_allclose(again.T_own_peer, closure.T_own_peer, atol=1e-15)
     assert not again.measured_from_peer
+
+
+def plain_clique(agree):
+    """The same greedy search, degrees counted anew at each step."""
+    agree, best = agree | np.eye(len(agree), dtype=bool), []
+    for start in np.argsort(-agree.sum(axis=1), kind="stable")[:10]:
+        clique, left = [start], [k for k in np.flatnonzero(agree[start]) if k != start]
+        while left:
+            chosen = left[int(np.argmax(agree[np.ix_(left, left)].sum(axis=1)))]
+            clique.append(chosen)
+            left = [k for k in left if k != chosen and agree[chosen, k]]
+        best = max(best, clique, key=len)
+    return np.isin(np.arange(len(agree)), best)
+
+
+def test_the_clique_is_that_of_a_plain_search():
+    rng = np.random.default_rng(7)
+    for _ in range(60):
+        m = int(rng.integers(1, 40))
+        agree = rng.random((m, m)) < rng.random()
+        agree |= agree.T
+        np.testing.assert_array_equal(loop_closures._clique(agree), plain_clique(agree))
+
+
+def test_a_clique_of_many_loop_closures_is_found_in_little_time():
+    began = time.process_time()
+    assert loop_closures._clique(np.ones((900, 900), dtype=bool)).all()
+    assert time.process_time() - began < 2.0  # with degrees counted anew at each step it is 7 s
+
+
+def test_blocks_of_rows_change_no_bit_and_bound_the_memory(monkeypatch):
+    rng = np.random.default_rng(8)
+    m = 400
+    frames, points = random_poses(rng, m), rng.normal(size=(m, 3))
+    tracemalloc.start()
+    disagreement = loop_closures._disagreement(frames, points)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    blocks = [*disagreement, loop_closures._distances(points)]
+    assert peak < 9 * 8 * m**2  # of all pairs at once 13
+    monkeypatch.setattr(loop_closures, "_ROWS", m)
+    whole = [*loop_closures._disagreement(frames, points), loop_closures._distances(points)]
+    for one, other in zip(blocks, whole, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_holder_is_the_end_that_copies_fewer_keyframes():
