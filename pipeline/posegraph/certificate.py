@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
 _KERNEL = 4  # three rows of Y, and the common shift
@@ -39,9 +40,10 @@ def is_global_minimum(factors: RelativePoses, T: Array) -> bool:
     if float(np.abs(S @ Y.T).max()) > _RESIDUAL * scale * max(1.0, float(np.abs(Y).max())):
         return False  # not stationary
     shifted = (S - _SHIFT * scale * sparse.identity(4 * n)).tocsc()
-    lu = sparse_linalg.splu(
-        shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
+    try:
+        lu = least_squares.decomposed(shifted, **least_squares.SYMMETRIC)
+    except DuagError:
+        return False
     symmetric = np.array_equal(lu.perm_r, lu.perm_c)  # else the pivots do not count eigenvalues
     return bool(symmetric and np.count_nonzero(lu.U.diagonal() < 0) == _KERNEL)
 

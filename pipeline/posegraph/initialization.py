@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
@@ -37,13 +36,15 @@ def chordal(factors: RelativePoses, n: int) -> Array:
     index = (np.concatenate(rows), np.concatenate(columns))
     M = sparse.csc_matrix((np.concatenate(values), index), shape=(3 * m, 3 * n))
     Y = np.concatenate([np.eye(3), np.zeros((3 * n - 3, 3))])
-    Y[3:] = sparse_linalg.splu((M[:, 3:].T @ M[:, 3:]).tocsc()).solve(-(M[:, 3:].T @ M[:, :3]).toarray())
+    Y[3:] = least_squares.decomposed((M[:, 3:].T @ M[:, 3:]).tocsc()).solve(
+        -(M[:, 3:].T @ M[:, :3]).toarray()
+    )
     rotations = so3.project(Y.reshape(n, 3, 3).swapaxes(-1, -2))
     e, root = np.arange(m), np.sqrt(factors.information[:, 0, 0])
     index = (np.concatenate([e, e]), np.concatenate([factors.j, factors.i]))
     B = sparse.csc_matrix((np.concatenate([root, -root]), index), shape=(m, n))[:, 1:]
     right = root[:, None] * (rotations[factors.i] @ factors.T_i_j[:, :3, 3:])[..., 0]
-    t = np.concatenate([np.zeros((1, 3)), sparse_linalg.splu((B.T @ B).tocsc()).solve(B.T @ right)])
+    t = np.concatenate([np.zeros((1, 3)), least_squares.decomposed((B.T @ B).tocsc()).solve(B.T @ right)])
     return se3.from_rotation_translation(rotations, t)
 
 

@@ -23,6 +23,7 @@ kappa |Rj - Ri Rij|_F^2 + tau |tj - ti - Ri tij|^2 of SE-Sync, because |Rj - Ri 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -131,12 +132,29 @@ def curvature_matrix(
 
 def factorized(H: sparse.csc_matrix) -> Callable[[Array], Array]:
     """Solver of H x = b for a symmetric positive definite sparse H."""
+    return decomposed(H, **SYMMETRIC).solve
+
+
+SYMMETRIC: dict[str, Any] = {
+    "permc_spec": "MMD_AT_PLUS_A",
+    "diag_pivot_thresh": 0.0,
+    "options": {"SymmetricMode": True},
+}
+"""Options of `decomposed` that pivot on the diagonal."""
+
+
+def decomposed(H: sparse.csc_matrix, **options: Any) -> sparse_linalg.SuperLU:
+    """Factors of a sparse matrix.
+
+    Args:
+        H: square.
+        options: of `scipy.sparse.linalg.splu`.
+    Raises:
+        DuagError: it is singular in its numbers.
+    """
     try:
-        lu = sparse_linalg.splu(
-            H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        return sparse_linalg.splu(H, **options)
     except RuntimeError as error:
         raise DuagError(
             f"pose graph: {error}: its numbers cannot be solved for, expected measurements of like size"
         ) from error
-    return lu.solve

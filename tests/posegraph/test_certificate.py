@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.sparse.linalg
 
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.certificate import is_global_minimum
@@ -26,6 +27,17 @@ def test_the_optimum_is_certified_in_every_frame():
 def test_a_point_that_is_no_minimum_is_not_certified():
     factors = graph(helix_edges(40))
     assert not is_global_minimum(factors, chordal(factors, 40))
+
+
+def test_numbers_that_nobody_can_solve_for_are_not_certified(monkeypatch):
+    factors = graph(helix_edges(40))
+    found = solve_pose_graph(factors, chordal(factors, 40))
+
+    def singular(*_, **__):
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr(scipy.sparse.linalg, "splu", singular)
+    assert not is_global_minimum(factors, found.poses)
 
 
 @pytest.mark.parametrize(("turns", "certified"), [(0, True), (1, False)])
