@@ -31,6 +31,7 @@ from duagc.pipeline.team_posegraph.team import Traffic, meet
 GAPS = {"1e-2": 1e-2, "1e-4": 1e-4, "1e-6": 1e-6}
 RAW_FACTOR_BYTES = 40  # two keys, rotation vector, translation, kappa, tau
 _TRUNCATIONS = 30
+_LEAST_COST = 1e-9  # of a factor: a lower optimum is rounding and tolerances
 
 
 @dataclass
@@ -72,6 +73,13 @@ def solve(
     graph = read_team_graph(path, robots, only_reference=only_reference)
     if len(graph.robots) > MAX_TEAM:
         raise DuagError(f"{path}: found {len(graph.robots)} robots, expected at most {MAX_TEAM}")
+    try:
+        return _solved(graph, path, config)
+    except DuagError as error:
+        raise DuagError(f"{path}: {error}") from error
+
+
+def _solved(graph: TeamGraph, path: Path, config: PoseGraphConfig) -> dict[str, Any]:
     c2 = config.consensus.truncation**2 if config.consensus.robust else None
     components = [_component(graph, members, config) for members in graph.components()]
     if c2 is None:
@@ -180,19 +188,22 @@ def _result(
     counted[~component.trusted] = kept
     first, bytes_before = component.setup
     reached: dict[str, tuple[int, int] | None] = {}
+    factors = len(component.graph.relative_poses)
     for name, gap in GAPS.items():
-        hit = next((t for t in component.trace if t[1] <= optimum.cost * (1 + gap)), None)
+        limit = optimum.cost + gap * _cost_scale(optimum.cost, factors)
+        hit = next((t for t in component.trace if t[1] <= limit), None)
         reached[name] = (hit[0] - first, hit[2]) if hit else None
     exchanges = max((a.exchanges for a in members if a.exchanges is not None), default=None)
     return {
         "robots": list(component.robots),
         "keyframes": len(T),
-        "factors": len(component.graph.relative_poses),
+        "factors": factors,
         "closures": component.closures,
         "cost": cost,
         "inlier_cost": float(squared[counted].sum()),
         "optimum": optimum.cost,
-        "gap": cost / optimum.cost - 1 if optimum.cost > 0 else None,
+        "optimum_converged": optimum.converged,
+        "gap": _gap(cost, optimum.cost, factors),
         "distance_rms_m": _distance(T, optimum.poses),
         "rounds": component.trace[-1][0] - first if component.trace else 0,
         "rounds_setup": first,
@@ -254,8 +265,19 @@ def _against_reference(
         inliers = component.graph.relative_poses.select(weights > 0)
         result["optimum"] = solved.cost
         result["certified"] = is_global_minimum(inliers, solved.poses)
-        result["gap"] = least_squares.cost(inliers, T) / solved.cost - 1 if solved.cost > 0 else None
+        result["optimum_converged"] = solved.converged
+        result["gap"] = _gap(least_squares.cost(inliers, T), solved.cost, len(inliers))
     return result
+
+
+def _gap(cost: float, optimum: float, factors: int) -> float | None:
+    """How far a cost is above the optimum, as a share of it; None without factors."""
+    return (cost - optimum) / _cost_scale(optimum, factors) if factors else None
+
+
+def _cost_scale(optimum: float, factors: int) -> float:
+    """What a gap is a share of: the optimum, or what counts as none where measurements contradict nowhere."""
+    return max(optimum, _LEAST_COST * factors)
 
 
 def _distance(T: Array, T_optimum: Array) -> float:
@@ -317,7 +339,8 @@ def _summary(
         "cost": total("cost"),
         "inlier_cost": total("inlier_cost"),
         "optimum": optimum,
-        "gap": total("cost") / optimum - 1 if optimum > 0 else None,
+        "optimum_converged": all(c["optimum_converged"] for c in components),
+        "gap": _gap(total("cost"), optimum, total("factors")),
         "rounds": max((c["rounds"] for c in components), default=0),
         "rounds_setup": max((c["rounds_setup"] for c in components), default=0),
         "bytes": traffic.bytes,

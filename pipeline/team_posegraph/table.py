@@ -38,7 +38,8 @@ def format_result(result: dict[str, Any]) -> str:
 def _component(c: dict[str, Any]) -> list[str]:
     lines = [
         f"{'cost':<28}{c['cost']:.8g}",
-        f"{'centralized optimum':<28}{c['optimum']:.8g}  (gap {_gap(c['gap'])}, {c['distance_rms_m']:.2g} m rms)",
+        f"{'centralized optimum':<28}{c['optimum']:.8g}  "
+        f"({_state(c)}gap {_gap(c['gap'])}, {c['distance_rms_m']:.2g} m rms)",
         f"{'rounds':<28}{c['rounds']}"
         + (f"  in {c['exchanges']} exchanges" if c["exchanges"] is not None else ""),
     ]
@@ -58,9 +59,14 @@ def _component(c: dict[str, Any]) -> list[str]:
             lines.append(f"{'cost of the reference':<28}{ref['cost_of_reference']:.8g}")
             certified = "certified" if ref["certified"] else "not certified"
             lines.append(
-                f"{'optimum of its inliers':<28}{ref['optimum']:.8g}  ({certified}; gap {_gap(ref['gap'])})"
+                f"{'optimum of its inliers':<28}{ref['optimum']:.8g}  "
+                f"({_state(ref)}{certified}; gap {_gap(ref['gap'])})"
             )
     return [*lines, ""]
+
+
+def _state(result: dict[str, Any]) -> str:
+    return "" if result["optimum_converged"] else "not converged; "
 
 
 def _share(ref: dict[str, Any]) -> str:

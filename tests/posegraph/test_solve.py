@@ -1,6 +1,7 @@
 """A team on the wire against the graph solved in one place, with every solver."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,14 +9,17 @@ import pytest
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.exchange import rounds as session_rounds
+from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.network.packets import MAX_PACKET_BYTES, parse
 from duagc.pipeline.posegraph.files import read_team_graph
+from duagc.pipeline.posegraph.pose_graph import solve_pose_graph
 from duagc.pipeline.team_posegraph import solve
 from duagc.pipeline.team_posegraph import team as team_rounds
 from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
+from duagc.pipeline.team_posegraph.table import format_result
 from duagc.pipeline.team_posegraph.team import Traffic, meet
 from tests.fixtures.commands import assert_one_line, duagc, duagc_here
-from tests.fixtures.pose_graphs import helix_edges, wild_edges, write_g2o, write_team
+from tests.fixtures.pose_graphs import g2o_line, helix, helix_edges, wild_edges, write_g2o, write_team
 
 N = 48
 
@@ -216,6 +220,44 @@ def test_too_many_robots_are_refused_before_anything_is_solved(tmp_path, monkeyp
     monkeypatch.setattr(solve, "solve_pose_graph", None)
     with pytest.raises(DuagError, match=r"helix.g2o: found 70 robots, expected at most 64"):
         solve.solve(path, settings("admm"), 70)
+
+
+@pytest.mark.parametrize("solver", ["admm", "elimination"])
+@pytest.mark.parametrize("tree", [False, True])
+def test_a_graph_without_contradictions_reaches_its_optimum(tmp_path, solver, tree):
+    T = helix(40)
+    pairs = [(k, k + 1) for k in range(39)] + ([] if tree else [(k, k + 8) for k in range(0, 32, 2)])
+    path = write_g2o(tmp_path / "exact.g2o", [(i, j, se3.inverse(T[i]) @ T[j]) for i, j in pairs])
+    result = solve.solve(path, settings(solver), 4)
+    assert result["converged"]
+    assert abs(result["gap"]) < 1e-2
+    assert None not in (result["rounds_to"]["1e-2"], result["bytes_to"]["1e-2"])
+    assert "to a gap of 1e-2            not reached" not in format_result(result)
+
+
+def test_an_optimum_that_has_not_converged_is_called_so(helix_file, monkeypatch):
+    result = solve.solve(helix_file, settings("elimination"), 2)
+    assert result["optimum_converged"]
+    assert result["components"][0]["optimum_converged"]
+    assert "not converged" not in format_result(result)
+    monkeypatch.setattr(solve, "solve_pose_graph", partial(solve_pose_graph, iterations=1))
+    for robust in ("none", "gnc"):
+        result = solve.solve(helix_file, settings("admm", robust), 2)
+        assert not result["optimum_converged"]
+        assert not result["components"][0]["optimum_converged"]
+        assert "(not converged; gap" in format_result(result)
+
+
+@pytest.mark.parametrize("robust", ["none", "gnc"])
+@pytest.mark.parametrize("weights", ["tau", "kappa"])
+def test_weights_that_nobody_can_solve_for_are_refused_with_the_file(tmp_path, weights, robust):
+    step = se3.from_rotation_translation(so3.exp(np.array([0, 0, 0.1])), [1.0, 0, 0])
+    even = {"tau": 100.0, "kappa": 100.0}
+    lines = [g2o_line(k, k + 1, step, **even | {weights: (1e10, 1e-10)[k % 2]}) for k in range(12)]
+    path = tmp_path / "uneven.g2o"
+    path.write_text("".join(lines))
+    with pytest.raises(DuagError, match=r"uneven.g2o: pose graph: .*cannot be solved for, expected"):
+        solve.solve(path, settings("admm", robust), 4)
 
 
 def test_a_robot_without_closures_does_not_hide_when_the_others_arrived(tmp_path):
