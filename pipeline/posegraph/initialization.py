@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -86,7 +88,7 @@ def graduated(trusted: RelativePoses, loops: RelativePoses, T: Array, config: Po
         config: threshold and schedule.
     """
     c2 = config.truncation**2
-    for mu in controls(config):
+    for mu in _schedule(least_squares.squared_residuals(loops, T), config):
         weights = graduated_weights(least_squares.squared_residuals(loops, T), c2, mu)
         if np.all((weights == 0.0) | (weights == 1.0)):
             break
@@ -94,6 +96,24 @@ def graduated(trusted: RelativePoses, loops: RelativePoses, T: Array, config: Po
         graph = RelativePoses.concatenate([trusted, loops.select(counts)])
         T = gauss_newton(graph, T, np.concatenate([np.ones(len(trusted)), weights[counts]]))
     return T
+
+
+def _schedule(squared: Array, config: PoseConsensusConfig) -> list[float]:
+    """Control parameters; from where the worst loop is just convex if all are too far off for the usual beginning.
+
+    A long walk may drift by thousands of standard deviations of its loops. Were all of them without weight, nothing
+    would bring the poses nearer.
+
+    Args:
+        squared: [m], squared residuals at the start.
+        config: threshold and schedule.
+    """
+    usual, c2 = controls(config), config.truncation**2
+    if graduated_weights(squared, c2, usual[0]).any():
+        return usual
+    convex = c2 / (2 * float(squared.max()) - c2)
+    earlier = math.ceil(math.log(usual[0] / convex) / math.log(config.robust_growth))
+    return [usual[0] * config.robust_growth**-k for k in range(earlier, 0, -1)] + usual
 
 
 def gauss_newton(graph: RelativePoses, T: Array, weights: Array) -> Array:
