@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from importlib import metadata
 from importlib.util import find_spec
 
+PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
 DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "google": "protobuf",

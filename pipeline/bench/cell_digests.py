@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import platform
 from collections.abc import Iterable
 from pathlib import Path
 
 from duagc.converters.simulate.render import mesh_process, meshes
 from duagc.converters.simulate.scenes.catalog import SCENES
-from duagc.pipeline.base.library_versions import library_version
+from duagc.pipeline.base.library_versions import PYTHON, library_version
 
 LIBRARIES = (
     "cryptography",
@@ -42,8 +41,7 @@ def code_digest() -> str:
 
 def library_versions() -> dict[str, str]:
     """Versions of the libraries, by module, and that of Python."""
-    python = ".".join(platform.python_version_tuple()[:2])
-    return {"python": python} | {name: library_version(name) for name in LIBRARIES}
+    return {"python": PYTHON} | {name: library_version(name) for name in LIBRARIES}
 
 
 def mesh_digest(scene: str) -> dict[str, str]:

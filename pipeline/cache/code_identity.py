@@ -18,14 +18,13 @@ from typing import Any
 
 import duagc
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.library_versions import library_version
+from duagc.pipeline.base.library_versions import PYTHON, library_version
 from duagc.pipeline.cache.publish import publish
 
 PACKAGE = "duagc"
 DATA_SUFFIXES = (".binpb", ".j2", ".css")
 SHOWN_ONLY = frozenset({"rich", "typer", "lazy_loader", "tomlkit"})
 """Libraries that no result depends on."""
-PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
 _RULES = f"1 {PYTHON}"  # of what is counted; part of every stored digest
 
 

@@ -341,9 +341,8 @@ def _of_sound_components(i: Index, j: Index, d: Array, owner: Index) -> NDArray[
     nodes, at = np.unique(np.concatenate([i, j]), return_inverse=True)
     ends = at.reshape(2, -1).T.tolist()
     parent = list(range(len(nodes)))
-    robots = [
-        1 << int(k) for k in owner[nodes]
-    ]  # of the component of a root, by bits; 0: one of them is there twice
+    # robots of the component of a root, by bits; 0: one of them is there twice
+    robots = [1 << int(k) for k in owner[nodes]]
 
     def root(node: int) -> int:
         while parent[node] != node:

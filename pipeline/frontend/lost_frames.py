@@ -108,13 +108,7 @@ def registered_again(
         )
         features = features_of(pyramid, tracking.relocalization)
         if result.ok and _confirmed(keyframe, features, result, config, rng=_draws(frame, keyframe)):
-            out[k] = TrackedFrame.by(
-                frame.frame_index,
-                frame.stamp_ns,
-                keyframe_index=frame.keyframe_index,
-                result=result,
-                status=frame.status,
-            )
+            out[k] = _relocalized(frame, keyframe, result)
     return out
 
 
@@ -142,14 +136,19 @@ def _found(
             _within_reach(frame, T_map_camera, other, T_map_keyframes, seen_m=seen_m, config=config)
             for other in around
         ):
-            return TrackedFrame.by(
-                frame.frame_index,
-                frame.stamp_ns,
-                keyframe_index=keyframe.keyframe_index,
-                result=result,
-                status=Status.RELOCALIZED,
-            )
+            return _relocalized(frame, keyframe, result)
     return None
+
+
+def _relocalized(frame: TrackedFrame, keyframe: TrackedKeyframe, result: Registration) -> TrackedFrame:
+    """The frame with the pose that its registration to a keyframe gives."""
+    return TrackedFrame.by(
+        frame.frame_index,
+        frame.stamp_ns,
+        keyframe_index=keyframe.keyframe_index,
+        result=result,
+        status=Status.RELOCALIZED,
+    )
 
 
 def _anchors(frames: Sequence[TrackedFrame], posed: Sequence[int], after: int, count: int) -> list[int]:

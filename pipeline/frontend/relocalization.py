@@ -16,7 +16,6 @@ from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.pose_checks import PLAUSIBLE, verify
 from duagc.pipeline.frontend.stable_registration import register_until_stable
-from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.align import reach_factor
@@ -107,23 +106,20 @@ class Relocalizer:
         self._unconfirmed = _Unconfirmed(place, frame.stamp_ns, 0)
         return Reason.UNCONFIRMED
 
-    def alike(self, state: TrackingState, frame: CurrentFrame) -> list[TrackedKeyframe]:
-        """Keyframes that may show what a frame shows.
+    def alike(self, state: TrackingState, frame: CurrentFrame) -> list[int]:
+        """Indices of the keyframes that may show what a frame shows.
 
         Args:
             state: what the tracker knows.
             frame: the frame.
         """
-        return [state.keyframes[index] for index in self._alike(state, frame)]
-
-    def _find(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | None:
-        """The place of a frame among all keyframes."""
-        return find_place(state, frame, self._alike(state, frame))
-
-    def _alike(self, state: TrackingState, frame: CurrentFrame) -> list[int]:
         for keyframe in state.keyframes[len(self._index) :]:
             self._index.add(keyframe.features.descriptors)
         return self._index.alike(frame.features.descriptors)
+
+    def _find(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | None:
+        """The place of a frame among all keyframes."""
+        return find_place(state, frame, self.alike(state, frame))
 
     def _confirm(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason | None:
         """Track on from a place that was found; None if the frame does not agree with it."""

@@ -78,7 +78,7 @@ class Tracker:
         Args:
             frame: the frame.
         """
-        return self._relocalizer.alike(self.state, frame)
+        return [self.keyframes[k] for k in self._relocalizer.alike(self.state, frame)]
 
     def copied(self, config: FrontendConfig | None = None) -> Tracker:
         """A tracker that goes on from the same state, independently of this one.

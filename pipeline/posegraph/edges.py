@@ -29,6 +29,22 @@ MAX_TRANSLATION_M = 1e6  # as far as robots can tell each other
 WEIGHTS = (1e-18, 1e18)  # of the information and of kappa and tau
 QUATERNION_NORMS = (1e-3, 1e3)
 _SINGULAR = 1e-13  # least eigenvalue of a block by its greatest, each direction scaled to one
+KIMERA_COLUMNS = [
+    "robot_src",
+    "pose_src",
+    "robot_dst",
+    "pose_dst",
+    "qx",
+    "qy",
+    "qz",
+    "qw",
+    "tx",
+    "ty",
+    "tz",
+    "kappa",
+    "tau",
+]
+"""Of `measurements.csv` of Kimera-Multi, which may have more."""
 
 Key = tuple[str, int]
 """Robot (or "" before a graph is cut), index."""
@@ -168,33 +184,18 @@ def _isotropic(upper: Array, path: Path, lines: list[int]) -> tuple[Array, Array
 
 def read_kimera(path: Path) -> Edges:
     """Edges of one robot's `measurements.csv` of Kimera-Multi; `weight` and `is_known_inlier` are ignored."""
-    needed = [
-        "robot_src",
-        "pose_src",
-        "robot_dst",
-        "pose_dst",
-        "qx",
-        "qy",
-        "qz",
-        "qw",
-        "tx",
-        "ty",
-        "tz",
-        "kappa",
-        "tau",
-    ]
     reader = csv.DictReader(read_text(path, "a pose graph").splitlines(), skipinitialspace=True)
-    missing = [name for name in needed if name not in (reader.fieldnames or [])]
+    missing = [name for name in KIMERA_COLUMNS if name not in (reader.fieldnames or [])]
     if missing:
-        raise DuagError(f"{path}: no column {missing[0]}, expected {', '.join(needed)}")
+        raise DuagError(f"{path}: no column {missing[0]}, expected {', '.join(KIMERA_COLUMNS)}")
     i: list[Key] = []
     j: list[Key] = []
     rows: list[list[float]] = []
     lines: list[int] = []
     for number, fields in enumerate(reader, start=2):
         try:
-            ids = [int(fields[name]) for name in needed[:4]]
-            row = [float(fields[name]) for name in needed[4:]]
+            ids = [int(fields[name]) for name in KIMERA_COLUMNS[:4]]
+            row = [float(fields[name]) for name in KIMERA_COLUMNS[4:]]
         except (TypeError, ValueError):
             raise DuagError(f"{path}: line {number} holds something that is not a number") from None
         if min(ids) < 0 or not np.isfinite(row).all() or min(row[7:]) <= 0 or not any(row[:4]):

@@ -34,11 +34,21 @@ def first_control(squared: Array, config: PoseConsensusConfig, first_mu: float =
         config: the least and the greatest control parameter, and the share.
         first_mu: at least this.
     """
-    c2, (least, last) = config.truncation**2, config.robust_mu
+    least, last = config.robust_mu
     least = max(least, first_mu)
+    return min(max(least, config.robust_convexity * convex_control(squared, config)), last)
+
+
+def convex_control(squared: Array, config: PoseConsensusConfig) -> float:
+    """The control parameter at which the worst factor is just convex; the greatest if it always is.
+
+    Args:
+        squared: [m], squared residuals.
+        config: threshold and the greatest control parameter.
+    """
+    c2 = config.truncation**2
     beyond = 2 * float(squared.max()) - c2
-    convex = c2 / beyond if beyond > 0 else last
-    return min(max(least, config.robust_convexity * convex), last)
+    return c2 / beyond if beyond > 0 else config.robust_mu[1]
 
 
 def controls(config: PoseConsensusConfig) -> list[float]:

@@ -12,7 +12,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph import least_squares
-from duagc.pipeline.posegraph.gnc import controls, graduated_weights
+from duagc.pipeline.posegraph.gnc import controls, convex_control, graduated_weights
 from duagc.pipeline.posegraph.pose_graph import solve_pose_graph
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
@@ -108,11 +108,10 @@ def _schedule(squared: Array, config: PoseConsensusConfig) -> list[float]:
         squared: [m], squared residuals at the start.
         config: threshold and schedule.
     """
-    usual, c2 = controls(config), config.truncation**2
-    if graduated_weights(squared, c2, usual[0]).any():
+    usual = controls(config)
+    if graduated_weights(squared, config.truncation**2, usual[0]).any():
         return usual
-    convex = c2 / (2 * float(squared.max()) - c2)
-    earlier = math.ceil(math.log(usual[0] / convex) / math.log(config.robust_growth))
+    earlier = math.ceil(math.log(usual[0] / convex_control(squared, config)) / math.log(config.robust_growth))
     return [usual[0] * config.robust_growth**-k for k in range(earlier, 0, -1)] + usual
 
 

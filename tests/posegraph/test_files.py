@@ -9,7 +9,7 @@ from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph import least_squares
-from duagc.pipeline.posegraph.edges import read_g2o, read_kimera
+from duagc.pipeline.posegraph.edges import KIMERA_COLUMNS, read_g2o, read_kimera
 from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.posegraph.pose_graph import PoseGraph
 from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
@@ -294,29 +294,14 @@ def test_a_folder_without_graphs_is_refused(tmp_path):
         read_team_graph(plain / "0.g2o", 2, only_reference=True)
 
 
-COLUMNS = [
-    "robot_src",
-    "pose_src",
-    "robot_dst",
-    "pose_dst",
-    "qx",
-    "qy",
-    "qz",
-    "qw",
-    "tx",
-    "ty",
-    "tz",
-    "kappa",
-    "tau",
-]
-FINE_ROW = dict.fromkeys(COLUMNS, 0.0) | {"pose_dst": 1, "qw": 1.0, "kappa": KAPPA, "tau": TAU}
+FINE_ROW = dict.fromkeys(KIMERA_COLUMNS, 0.0) | {"pose_dst": 1, "qw": 1.0, "kappa": KAPPA, "tau": TAU}
 
 
 def write_table(folder, rows, separator=","):
     """`measurements.csv` of one robot."""
-    lines = [[f"{row[n]:.0f}" if "_" in n else repr(float(row[n])) for n in COLUMNS] for row in rows]
+    lines = [[f"{row[n]:.0f}" if "_" in n else repr(float(row[n])) for n in KIMERA_COLUMNS] for row in rows]
     path = folder / "measurements.csv"
-    path.write_text("\n".join(separator.join(words) for words in [COLUMNS, *lines]))
+    path.write_text("\n".join(separator.join(words) for words in [KIMERA_COLUMNS, *lines]))
     return path
 
 
