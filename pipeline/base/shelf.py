@@ -89,7 +89,7 @@ class Shelf:
         try:
             with tempfile.TemporaryFile(prefix="duagc-") as file:
                 for array, size in zip(arrays, sizes, strict=True):
-                    file.write(array.tobytes())
+                    file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
                     file.write(bytes(size - array.nbytes))
                 file.flush()
                 mapping = _Mapping(file.fileno(), sum(sizes), prot=mmap.PROT_READ)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,6 +53,16 @@ def test_pages_are_given_back_and_come_again() -> None:
     kept.sweep()
     assert _resident_kb() < before - 30_000
     assert [float(value[0].sum()) for value in values] == [1e6 * k for k in range(5)]
+
+
+def test_an_array_is_not_copied_in_memory_to_be_written() -> None:
+    value = (np.ones((1_000_000, 4)), np.array(3.0), np.arange(5)[::-1])
+    tracemalloc.start()
+    found = shelf.Shelf().put(value)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < value[0].nbytes / 10
+    assert all(np.array_equal(a, b) and a.shape == b.shape for a, b in zip(found, value, strict=True))
 
 
 def test_what_is_in_a_file_is_not_written_again() -> None:
