@@ -39,20 +39,22 @@ class Transforms:
         self.warnings = [] if warnings is None else warnings
         topics = log.of_type(*TF_TYPES)
         own = [t for t in topics if is_below(t, namespace) or "/" not in t.lstrip("/")]
-        own.sort(key=lambda t: "/" in t.lstrip("/"))  # the robot's own word counts last
         self._static_topics = [t for t in own if t.endswith("tf_static")]
         self._other_topics = [t for t in own if not t.endswith("tf_static")]
         self.moving: set[tuple[str, str]] = set()
         self._known: dict[tuple[str, str], Array] = {}
         self._broken: dict[tuple[str, str], str] = {}  # why, of those that no message states well
-        for topic in self._static_topics:
-            self._known.update(self._constant([topic]))
+        for namespaced in (False, True):  # the robot's own word counts last
+            stating = [t for t in self._static_topics if ("/" in t.lstrip("/")) is namespaced]
+            self._known.update(self._constant(stating))
+        self._known = {pair: T for pair, T in self._known.items() if pair not in self.moving}
         self._complete = not self._other_topics
 
     def _constant(self, topics: list[str]) -> dict[tuple[str, str], Array]:
         """The transforms of some topics of which all messages say the same; what differs is `moving`.
 
-        On /tf_static too: two robots may have published there, each its own frames by the same names.
+        On /tf_static too: two robots may have published there, or on topics of their own, each its own frames by the
+        same names.
         """
         found: dict[tuple[str, str], Array] = {}
         changed = set()

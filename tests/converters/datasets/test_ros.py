@@ -255,6 +255,21 @@ def test_robots_whose_frames_have_the_same_names(tmp_path: Path) -> None:
     registry.convert("ros", bag, tmp_path / "rec", options=["namespaces=/camera"])
 
 
+def test_two_robots_state_the_same_frames_on_topics_of_their_own(tmp_path: Path) -> None:
+    """Without a namespace nobody knows whose frames are meant; which topic came last decided."""
+    r = Ros(1)
+    rows = scene(r)
+    static = next(m for t, _, m in rows if t == "/tf_static")
+    other = r.tf(r.transform(START_NS, "_depth", "_color", np.eye(4)))
+    rest = [row for row in rows if row[0] != "/tf_static"]
+    words = r"does not tie them \(what changes is no extrinsic: _depth to _color\)"
+    for k, shared in enumerate(([], [("/tf_static", START_NS, static)])):
+        own = [("/a/tf_static", START_NS, static), ("/b/tf_static", START_NS, other), *shared, *rest]
+        bag = r.write(tmp_path / f"bag{k}", own, "plain")
+        with pytest.raises(DuagError, match=words):
+            registry.convert("ros", bag, tmp_path / "rec")
+
+
 def test_poses_of_nobody_knows_which_body_are_no_odometry(tmp_path: Path) -> None:
     """The base of a robot looks along x, its camera along z."""
     r, rows = Ros(2), scene(Ros(2))
