@@ -263,9 +263,11 @@ class RobotLog:
         delays, recorded = array("q"), array("q")
 
         def take_image(entry: Entry) -> None:
-            stamps[entry.topic].append(self.time_ns(entry))
-            delays.append(entry.log_ns - stamps[entry.topic][-1])
-            recorded.append(entry.log_ns)
+            stamp_ns = self.time_ns(entry)
+            stamps[entry.topic].append(stamp_ns)
+            if stamp_ns:  # else nobody set it: such images are left out
+                delays.append(entry.log_ns - stamp_ns)
+                recorded.append(entry.log_ns)
 
         cameras = CameraWatch(self._cameras, self.name)
         takers: list[tuple[str, Callable[[Entry], None]]] = [*self._motion.take]

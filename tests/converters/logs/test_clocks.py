@@ -267,6 +267,23 @@ def test_a_drift_is_told_and_taken_out_if_asked(tmp_path: Path) -> None:
     assert settled[1] - kept[1] == pytest.approx(400e-6 * (kept[1] - kept[0]), rel=0.04)
 
 
+def test_an_image_without_a_time_hides_no_drift(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = drifting(r, 120, 400.0)
+    at = next(k for k, row in enumerate(rows) if "image" in row[0] and k > len(rows) // 2)
+    topic, stamp_ns, message = rows[at]
+    rows[at] = moved_headers(r, [(topic, 0, message)], -message.header.stamp.sec * 10**9)[0]
+    rows[at][2].header.stamp.nanosec = 0
+    rows[at] = (topic, stamp_ns, rows[at][2])
+    bag = r.write(tmp_path / "bag", rows, "mcap")
+    registry.convert("ros", bag, tmp_path / "settled", options=["clocks=estimated"])
+    assert any("images without a time" in w for w in warnings_of(tmp_path / "settled"))
+    assert any(
+        "the recorder's clock gains 4" in w and "taken out" in w for w in warnings_of(tmp_path / "settled")
+    )
+    assert span(tmp_path / "settled")[1] - span(tmp_path / "settled")[0] < 150 * 10**9
+
+
 def test_clocks_of_one_rate_are_left_alone(tmp_path: Path) -> None:
     r = Ros(2)
     bag = r.write(tmp_path / "bag", drifting(r, 120, 0.0), "mcap")
