@@ -35,6 +35,13 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
+SYMMETRIC: dict[str, Any] = {
+    "permc_spec": "MMD_AT_PLUS_A",
+    "diag_pivot_thresh": 0.0,
+    "options": {"SymmetricMode": True},
+}
+"""Options of `decomposed` that pivot on the diagonal."""
+
 
 def retract(T: Array, delta: Array) -> Array:
     """x (+) delta: poses [n, 4, 4] moved by tangents [n, 6] (translation, rotation) of the product group."""
@@ -133,14 +140,6 @@ def curvature_matrix(
 def factorized(H: sparse.csc_matrix) -> Callable[[Array], Array]:
     """Solver of H x = b for a symmetric positive definite sparse H."""
     return decomposed(H, **SYMMETRIC).solve
-
-
-SYMMETRIC: dict[str, Any] = {
-    "permc_spec": "MMD_AT_PLUS_A",
-    "diag_pivot_thresh": 0.0,
-    "options": {"SymmetricMode": True},
-}
-"""Options of `decomposed` that pivot on the diagonal."""
 
 
 def decomposed(H: sparse.csc_matrix, **options: Any) -> sparse_linalg.SuperLU:
