@@ -6,6 +6,7 @@ when they are looked at. The system takes the pages back now and then. Values st
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import mmap
 import os
@@ -27,6 +28,8 @@ MOST_FILES = 1 << 16
 """Open files that are asked for, if the system allows so many."""
 SWEEP_AFTER = 16
 """Objects, after which all pages are given back that were looked at since."""
+
+_malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
 
 
 class _Mapping(mmap.mmap):
@@ -51,8 +54,8 @@ class Shelf:
         """An equal object, whose arrays are in a file and cannot be written.
 
         Args:
-            value: data classes and tuples with arrays; arrays that are in a file, and anything else, are taken as they
-                are.
+            value: data classes, tuples and dictionaries with arrays; arrays that are in a file, and anything else, are
+                taken as they are.
         """
         arrays: list[np.ndarray] = []
         _collect(value, arrays)
@@ -75,11 +78,17 @@ class Shelf:
             self.sweep()
         return shelved
 
-    def sweep(self) -> None:
-        """Give the memory of all files back until they are looked at again."""
+    def sweep(self, *, heap: bool = False) -> None:
+        """Give the memory of all files back until they are looked at again.
+
+        Args:
+            heap: also what was freed between arrays that are in use; takes some milliseconds.
+        """
         self._new = 0
         for mapping in list(self._mappings):
             mapping.madvise(mmap.MADV_DONTNEED)
+        if heap and _malloc_trim is not None:
+            _malloc_trim(0)
 
     def _written(self, arrays: list[np.ndarray], sizes: list[int]) -> _Mapping | None:
         """A file with the arrays; None if there is no room for it."""
@@ -129,6 +138,8 @@ def _collect(value: Any, arrays: list[np.ndarray]) -> None:
     elif isinstance(value, tuple):
         for part in value:
             _collect(part, arrays)
+    elif isinstance(value, dict):
+        _collect(tuple(value.values()), arrays)
     elif is_dataclass(value):
         for field in fields(value):
             _collect(getattr(value, field.name), arrays)
@@ -140,6 +151,8 @@ def _rebuilt(value: Any, views: Iterator[np.ndarray]) -> Any:
         return next(views)
     if isinstance(value, tuple):
         return tuple(_rebuilt(part, views) for part in value)
+    if isinstance(value, dict):
+        return {key: _rebuilt(part, views) for key, part in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
         return type(value)(**{f.name: _rebuilt(getattr(value, f.name), views) for f in fields(value)})
     return value

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import ColorConfig
-from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
+from duagc.pipeline.consensus.evidence import Evidence, PlacedGaussians, rows_by_id
 from duagc.pipeline.geometry.color_comparison import ComparedColors, compare_colors
 from duagc.pipeline.splat.information import COLOR, COLOR_INFORMATION
 
@@ -114,7 +114,9 @@ class TeamColors:
         )
 
 
-def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorConfig) -> TeamColors:
+def team_colors(
+    evidence: Mapping[str, Evidence | PlacedGaussians], pairs: Pairs, config: ColorConfig
+) -> TeamColors:
     """How the cameras of a team differ.
 
     Args:
@@ -162,7 +164,9 @@ def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorCon
     )
 
 
-def _colors_of(own: Evidence, other: Evidence, ids: NDArray[np.int64]) -> tuple[Array, Array]:
+def _colors_of(
+    own: Evidence | PlacedGaussians, other: Evidence | PlacedGaussians, ids: NDArray[np.int64]
+) -> tuple[Array, Array]:
     """Colors [m, 3] of matched Gaussians on which both robots have information."""
     i, j = rows_by_id(ids[:, 0], own.ids), rows_by_id(ids[:, 1], other.ids)
     here = (i >= 0) & (j >= 0)

@@ -73,6 +73,28 @@ class MapInformation(Protocol):
 
 
 @dataclass(frozen=True)
+class PlacedGaussians:
+    """Gaussians of one robot in a common frame, as they are compared with those of another.
+
+    Attributes:
+        ids: int64 [n].
+        theta: float64 [n, 13].
+        color: [n, 3], information on the color of each.
+    """
+
+    ids: NDArray[np.int64]
+    theta: Array
+    color: NDArray[np.floating]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def color_information(self) -> NDArray[np.floating]:
+        """[n, 3]."""
+        return self.color
+
+
+@dataclass(frozen=True)
 class Evidence:
     """A robot's own evidence on n of its Gaussians. It never contains what came from a peer.
 
@@ -166,13 +188,12 @@ class Evidence:
         """theta and information with every anchor's frame moved by its T [k, 4, 4]."""
         if not len(self):
             return self
-        theta, information = self.theta.copy(), self.information.copy()
+        theta = moved_parameters(self.theta, T_new_anchor, self.anchors)
+        information = self.information.copy()
         D_of_anchor = spd.sym_rotation(T_new_anchor[:, :3, :3])
         for rows in row_blocks(len(self)):
-            T, D = T_new_anchor[self.anchors[rows]], D_of_anchor[self.anchors[rows]]
-            R, before, block = T[:, :3, :3], self.information[rows], theta[rows]
-            block[:, MEAN] = (R @ block[:, MEAN, None])[..., 0] + T[:, :3, 3]
-            block[:, LOG_COVARIANCE] = (D @ block[:, LOG_COVARIANCE, None])[..., 0]
+            R, D = T_new_anchor[self.anchors[rows], :3, :3], D_of_anchor[self.anchors[rows]]
+            before = self.information[rows]
             information[rows, MEAN_INFORMATION] = pack_symmetric(R @ mean_block(before) @ R.swapaxes(-1, -2))
             information[rows, LOG_COVARIANCE_INFORMATION] = pack_symmetric(
                 D @ log_covariance_block(before) @ D.swapaxes(-1, -2)
@@ -194,6 +215,23 @@ class Evidence:
     def opacity_information(self) -> Array:
         """[n], over the logit."""
         return self.information[:, OPACITY_INFORMATION]
+
+
+def moved_parameters(theta: Array, T_new_anchor: Array, anchors: NDArray[np.integer]) -> Array:
+    """Parameters [n, 13] in another frame.
+
+    Args:
+        theta: [n, 13], each in the frame of its anchor.
+        T_new_anchor: [k, 4, 4], poses of the anchors in the other frame.
+        anchors: [n], the anchor of each.
+    """
+    moved = theta.astype(np.float64)
+    D_of_anchor = spd.sym_rotation(T_new_anchor[:, :3, :3])
+    for rows in row_blocks(len(theta)):
+        T, D, block = T_new_anchor[anchors[rows]], D_of_anchor[anchors[rows]], moved[rows]
+        block[:, MEAN] = (T[:, :3, :3] @ block[:, MEAN, None])[..., 0] + T[:, :3, 3]
+        block[:, LOG_COVARIANCE] = (D @ block[:, LOG_COVARIANCE, None])[..., 0]
+    return moved
 
 
 def _in_blocks(

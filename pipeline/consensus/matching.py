@@ -27,15 +27,16 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.row_blocks import in_blocks
+from duagc.pipeline.base.row_blocks import in_blocks, row_blocks
 from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.consensus.colors import ColorMap, team_colors
-from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.consensus.evidence import Evidence, PlacedGaussians
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY
 
 Index = NDArray[np.int64]
 Pairs = Mapping[tuple[str, str], Index]
+Placed = Evidence | PlacedGaussians
 SH_C0 = 0.28209479177387814  # color = 0.5 + SH_C0 * coefficient
 _CHUNK = 200_000  # pairs per pass, for memory
 _FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
@@ -138,12 +139,12 @@ def _threshold(chart: _Chart, near: Index, other: Index, config: MapMatching) ->
     return float(np.percentile(_distances((chart, chart), near, other, config), config.percentile))
 
 
-def match(own: Evidence, peer: Evidence, config: MapMatching) -> Index:
+def match(own: Placed, peer: Placed, config: MapMatching) -> Index:
     """Matched Gaussians of two robots: within the radius, d_G below tau_G, and each the other's best.
 
     Args:
-        own: all evidence of the computing robot, in the world frame; gives tau_G.
-        peer: evidence of the other robot, in the world frame, in its own camera's colors.
+        own: all Gaussians of the computing robot, in the world frame; they give tau_G.
+        peer: those of the other robot, in the world frame, in its own camera's colors.
         config: radius and scales of the distance.
     Returns:
         int64 [m, 2], ids of (own, peer), ascending; each id at most once.
@@ -163,21 +164,21 @@ class _Both:
     """Two maps that are matched, none empty: candidates and charts, which do not depend on colors but hold them.
 
     Attributes:
-        own: evidence of the computing robot.
-        peer: of the other one.
+        own: Gaussians of the computing robot.
+        peer: of the other one, in its own camera's colors.
         charts: of both.
         candidates: rows of both.
         neighbors: rows of the own map and of their nearest other ones; empty where there is but one Gaussian.
     """
 
-    own: Evidence
-    peer: Evidence
+    own: Placed
+    peer: Placed
     charts: tuple[_Chart, _Chart]
     candidates: tuple[Index, Index]
     neighbors: tuple[Index, Index]
 
     @staticmethod
-    def of(own: Evidence, peer: Evidence, config: MapMatching) -> _Both:
+    def of(own: Placed, peer: Placed, config: MapMatching) -> _Both:
         nobody = np.zeros(0, np.int64)
         return _Both(
             own,
@@ -188,11 +189,12 @@ class _Both:
         )
 
     def in_colors(self, colors: ColorMap) -> _Both:
-        """With the peer's Gaussians in other colors."""
-        peer = colors.of(self.peer)
+        """With the chart of the peer's Gaussians in other colors."""
+        if colors.is_identity:
+            return self
         theta = self.charts[1].theta.copy()
-        theta[:, COLOR] = peer.theta[:, COLOR]
-        return replace(self, peer=peer, charts=(self.charts[0], replace(self.charts[1], theta=theta)))
+        theta[:, COLOR] = colors.to_other(self.peer.theta[:, COLOR])
+        return replace(self, charts=(self.charts[0], replace(self.charts[1], theta=theta)))
 
     def matched(self, config: MapMatching) -> Index:
         """Ids of (own, peer), as `match`."""
@@ -212,13 +214,16 @@ def _candidates(means_own: Array, means_peer: Array, config: MapMatching) -> tup
     """Rows (own, peer) within the radius: the nearest few of either side, each pair once."""
     found = []
     for a, b, turned in ((means_own, means_peer, False), (means_peer, means_own, True)):
-        k = min(config.candidates, len(b))
-        distance, neighbor = cKDTree(b).query(a, k=[*range(1, k + 1)], distance_upper_bound=config.radius_m)
-        row, rank = np.nonzero(np.isfinite(distance))
-        column = neighbor[row, rank]
-        own, peer = (column, row) if turned else (row, column)
-        found.append(own * len(means_peer) + peer)
-    key = np.sort(np.concatenate(found))
+        ranks, tree = [*range(1, min(config.candidates, len(b)) + 1)], cKDTree(b)
+        for rows in row_blocks(len(a)):
+            distance, neighbor = tree.query(a[rows], k=ranks, distance_upper_bound=config.radius_m)
+            row, rank = np.nonzero(np.isfinite(distance))
+            row, column = row + rows.start, neighbor[row, rank]
+            own, peer = (column, row) if turned else (row, column)
+            found.append(own * len(means_peer) + peer)
+    key = np.concatenate(found)
+    del found
+    key.sort()
     key = key[np.diff(key, prepend=-1) > 0]
     return key // len(means_peer), key % len(means_peer)
 
@@ -229,8 +234,9 @@ def _first_of_each(group: Index, d: Array, tie: Index) -> Index:
         return np.zeros(0, np.int64)
     order = np.argsort(group, kind="stable")
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    least = np.minimum.reduceat(d[order], starts)
-    nearest = order[d[order] == np.repeat(least, np.diff(starts, append=len(order)))]
+    sorted_d = d[order]
+    least = np.minimum.reduceat(sorted_d, starts)
+    nearest = order[sorted_d == np.repeat(least, np.diff(starts, append=len(order)))]
     nearest = nearest[np.lexsort((tie[nearest], group[nearest]))]
     return nearest[np.diff(group[nearest], prepend=-1) > 0]
 

@@ -12,7 +12,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.exchange import EvidenceOrder
-from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.consensus.evidence import Evidence, PlacedGaussians, moved_parameters
 from duagc.pipeline.consensus.matching import match
 from duagc.pipeline.consensus.weighting import shared_evidence
 from duagc.pipeline.exchange.wire.evidence_wire import record_dtype
@@ -20,7 +20,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import Kind
 from duagc.pipeline.runs.robot_data import RobotData
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.information import INFORMATION_DIAGONAL, MEAN
+from duagc.pipeline.splat.information import COLOR_INFORMATION, INFORMATION_DIAGONAL, MEAN
 
 Records = NDArray[Any]
 
@@ -133,5 +133,12 @@ def match_pairs(
         peer: the same of the other robot.
         config: of the matching.
     """
-    a, b = (to_evidence(name, records).in_world(T_common) for name, records, T_common in (own, peer))
+    a, b = (
+        PlacedGaussians(
+            records["id"].astype(np.int64),
+            moved_parameters(records["theta"], T_common, records["anchor"]),
+            records["information"][:, COLOR_INFORMATION],
+        )
+        for _, records, T_common in (own, peer)
+    )
     return match(a, b, config)

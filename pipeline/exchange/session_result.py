@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.exchange.evidence_records import to_evidence
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.neighbor import Neighbor
@@ -41,8 +42,8 @@ def result_of(agent: MapAgent) -> SessionResult:
         component=tuple(sorted(names)),
         T_world_keyframe=T_world[robot],
         T_world_keyframe_of=T_world,
-        own_evidence=to_evidence(robot, own[np.argsort(own["id"])]),
-        evidence={name: to_evidence(name, records) for name, records in evidence.items()},
+        own_evidence=SHELF.put(to_evidence(robot, own[np.argsort(own["id"])])),
+        evidence={name: SHELF.put(to_evidence(name, records)) for name, records in evidence.items()},
         # a robot that sent no kind of depth sent no Gaussian either: nothing of it is rendered
         depth_of={name: depths[name] or agent.data.depth for name in evidence},
         arrived={team[i]: agent.config.evidence_share * knowledge.share(i) for i in others if i in placed},

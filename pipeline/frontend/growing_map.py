@@ -14,6 +14,7 @@ from typing import Any, SupportsIndex
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.geometry.view_extent import radii_m
 from duagc.pipeline.kernels import CompiledAdam, Gradients
@@ -104,6 +105,11 @@ class GrowingMap:
         self.keep(rest)
         return part
 
+    def shelve(self) -> None:
+        """Lay all that it knows into a file: until it is looked at again, it takes no memory."""
+        self.go_on(SHELF.put(self.state()))
+        SHELF.sweep(heap=True)
+
     def put_back(self, part: GrowingMap) -> None:
         """Put Gaussians back that were taken out, after those that stayed.
 
@@ -118,8 +124,9 @@ class GrowingMap:
     def _selected(self, rows: Indices, counts: tuple[int, int, int]) -> tuple[Any, ...]:
         """The state of a map of some of the Gaussians."""
         adam = CompiledAdam(threads=self.adam.threads)
-        adam.append(self.adam)
+        adam.go_on(self.adam.state())
         adam.select(rows)
+        adam.freeze_after(None)
         gaussians = self.gaussians.select(rows)
         begun = _balls(gaussians.select(slice(counts[1])))
         return gaussians, self.contribution[rows], counts, begun, adam.state()

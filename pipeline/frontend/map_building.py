@@ -17,6 +17,7 @@ from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
+from duagc.pipeline.base.shelf import SHELF, SWEEP_AFTER
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.growing_map import GrowingMap
@@ -174,6 +175,8 @@ class MapBuilder:
                 add = partial(mapper.add_keyframe, iterations=steps[k])
                 stats = self._with_images(add, k)
                 updates.append(stats.message(self._keyframes[k], self.name, len(self._whole) + stats.total))
+                if len(updates) % SWEEP_AFTER == 0:
+                    SHELF.sweep(heap=True)
                 self._checkpoints.at(
                     part,
                     len(updates),
@@ -215,6 +218,7 @@ class MapBuilder:
                 T_map_camera = self._pose(frame.keyframe_index) @ frame.T_keyframe_camera
                 seen.append((ViewExtent.of(depth_m, self.log.camera), T_map_camera))
             begun = take_tile(self._whole, tile, seen[: len(tile)], seen[len(tile) :])
+            self._whole.shelve()
         mapper = Mapper(
             self.log.camera,
             config,

@@ -76,6 +76,44 @@ def test_what_is_in_a_file_is_not_written_again() -> None:
     assert len(kept) == 2
 
 
+def test_what_is_in_a_dictionary_is_put_there_too() -> None:
+    value = {"a": np.ones((300, 300)), "b": (np.arange(30_000), "text")}
+    found = shelf.Shelf().put(value)
+    assert list(found) == ["a", "b"]
+    assert np.array_equal(found["a"], value["a"])
+    assert not found["a"].flags.writeable
+    assert not found["b"][0].flags.writeable
+    assert found["b"][1] == "text"
+    assert value["a"].flags.writeable
+
+
+def test_what_was_freed_between_arrays_in_use_is_given_back() -> None:
+    """In a process of its own, whose heap nothing else has used."""
+    program = """
+from pathlib import Path
+import numpy as np
+from duagc.pipeline.base import shelf
+from duagc.pipeline.base.determinism import configure_determinism
+def kb():
+    status = Path("/proc/self/status").read_text().split()
+    return int(status[status.index("RssAnon:") + 1])
+configure_determinism()
+arrays = [np.ones(1 << 17) for _ in range(100)]
+most = kb()
+del arrays[1::2]
+kept = shelf.Shelf()
+kept.sweep()
+left = kb()
+kept.sweep(heap=True)
+print((most - left) >> 10, (most - kb()) >> 10, all((array == 1).all() for array in arrays))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    pages, heap, equal = done.stdout.split()
+    assert int(pages) < 10
+    assert int(heap) > 40  # MiB, of 50
+    assert equal == "True"
+
+
 def test_small_objects_stay_in_memory() -> None:
     value, kept = (np.zeros(10),), shelf.Shelf()
     assert kept.put(value) is value

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import pytest
 
+from duagc.pipeline.base import shelf
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping import Mapper
@@ -82,14 +83,20 @@ def _by_id(gaussians: Gaussians) -> Gaussians:
     return gaussians.select(np.argsort(gaussians.ids, kind="stable"))
 
 
-def test_what_is_taken_out_and_put_back_is_the_same_map() -> None:
+def test_what_is_taken_out_and_put_back_is_the_same_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shelf, "LEAST_BYTES", 0)  # this map is small
     whole = _grown(3)
     before, moments = whole.gaussians, whole.adam.state()[1]["means"]
     part = take_tile(whole, [1], _sights([1]), _sights([2]))
     assert 0 < part.guests < len(part)
     assert (part.gaussians.anchors[part.guests :] == 1).all()
     assert not (whole.gaussians.anchors == 1).any()
+    whole.shelve()
+    assert not whole.gaussians.means.flags.writeable
+    assert not whole.adam.state()[1]["means"].flags.writeable
     whole.put_back(part)
+    assert whole.gaussians.means.flags.writeable
+    assert whole.adam.state()[1]["means"].flags.writeable
     order = np.argsort(whole.gaussians.ids, kind="stable")
     assert same(whole.gaussians.select(order), before)
     assert np.array_equal(whole.adam.state()[1]["means"][order], moments)
