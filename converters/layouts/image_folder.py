@@ -244,13 +244,14 @@ def _write_clip(robot: RobotWriter, clip: Clip, lens: _Lens, label: str) -> dict
 def _with_new_depth(frames: Sequence[FrameFiles]) -> list[bool]:
     """Whether the depth of each frame is written with it.
 
-    Depth with a time of its own is written once; frames that share it come one after the other.
+    Depth is written once at its own time, and also with every frame that is too far from it to keep that time; frames
+    that share it come one after the other.
     """
     written: set[Path] = set()
     new = []
     for files in frames:
         new.append(files.depth is not None and (files.depth not in written or files.depth_stamp_ns is None))
-        if files.depth is not None:
+        if files.depth is not None and files.depth_stamp_ns is not None:
             written.add(files.depth)
     return new
 

@@ -139,6 +139,19 @@ def test_association_policies(made: dict[str, tuple[Path, Path]], tmp_path: Path
     assert pairs == [(0, 8), (10, 8), (30, 12)]
 
 
+def test_depth_of_far_and_near_images_keeps_its_time(
+    made: dict[str, tuple[Path, Path]], tmp_path: Path
+) -> None:
+    """Taken as of the time of an image that is too far from it, depth is there for the near ones at its own time."""
+    src = tmp_path / made["tum"][0].name
+    shutil.copytree(made["tum"][0], src)
+    edit(src / "depth.txt", lambda text: text.splitlines()[6] + "\n")
+    registry.convert("tum", src, tmp_path / "rec", options=["max_difference_s=1"])
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        offsets_ms = [frame.depth_offset_ns / 1e6 for frame in log.frames()]
+    assert offsets_ms == pytest.approx([0, -33.3, 48.3, 15, -18.3, -51.7], abs=0.1)
+
+
 def test_poses_are_interpolated_and_never_extrapolated() -> None:
     T = np.array([se3.exp(np.array([s, 0, 0, 0, 0, s])) for s in (0.0, 0.2)])
     poses = tum_layout.Poses(np.array([0, 100_000_000]), T, 0)
