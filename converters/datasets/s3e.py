@@ -33,6 +33,7 @@ from duagc.converters.layouts.derived_depth import (
     spread,
 )
 from duagc.converters.layouts.image_files import options_of
+from duagc.converters.layouts.ros_points import VELODYNE
 from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
 from duagc.converters.layouts.tum_layout import nanoseconds
 from duagc.converters.logs import open_log
@@ -289,7 +290,7 @@ class _Vehicle:
         self.T_camera_imu = T_camera_left @ c.T_left_imu
         self.readings = imu_readings((entry.header_ns(), entry) for entry in log.entries(self.imu))
         motion = gyro(self.readings, self.T_camera_imu)
-        self.lidar = LidarSource(T_camera_left @ c.T_left_lidar, settings.range_sigma_m, motion)
+        self.lidar = LidarSource(T_camera_left @ c.T_left_lidar, settings.range_sigma_m, motion, VELODYNE)
         self.groups = self._groups()
         self.truth = self._truth(fixes, origin)
 

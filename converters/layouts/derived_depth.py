@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.ros_images import color_bytes
-from duagc.converters.layouts.ros_points import as_of, points_of
+from duagc.converters.layouts.ros_points import PointTimes, as_of, points_of
 from duagc.converters.layouts.stereo import RowCheck, StereoRig
 from duagc.converters.logs.entries import Entry
 from duagc.converters.robot_writer import RobotWriter
@@ -34,15 +34,17 @@ class LidarSource:
 
     Attributes:
         motion: of that camera, to take out what it moved during a sweep; None: not known.
+        times: how its points say when they were measured.
     """
 
     T_camera_lidar: Array
     range_sigma_m: float
     motion: MotionPrior | None
+    times: PointTimes
 
     def points(self, message: Any, stamp_ns: int, at_ns: int, where: str) -> Array:
         """Points [n, 3] of a sweep with this stamp, all as of one time."""
-        points, seconds = points_of(message, where)
+        points, seconds = points_of(message, where, self.times)
         times_ns = stamp_ns + np.rint(seconds * 1e9).astype(np.int64)
         return as_of(at_ns, points, times_ns, self.T_camera_lidar, motion=self.motion)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ from duagc.converters.layouts.derived_depth import (
 )
 from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.layouts.ros_images import color_bytes
+from duagc.converters.layouts.ros_points import PointTimes
 from duagc.converters.layouts.stereo import RawCamera, StereoRig
 from duagc.converters.layouts.validity import of_maps
 from duagc.converters.logs.files import Log
@@ -33,6 +35,8 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.motion import MotionPrior
+
+TIMED_SWEEPS = 8  # by which it is found how points say their times
 
 
 @dataclass(frozen=True)
@@ -224,7 +228,8 @@ def sweeps_of(
             f"{log.name}: {topic} is of {frame!r}, and /tf_static does not tie it to {color[1].frame_id!r}; "
             "expected --set T_color_depth='x y z qw qx qy qz' of the LiDAR"
         )
-    lidar = LidarSource(T, settings.range_sigma_m, motion)
+    some = [entry.read() for entry in islice(log.entries(topic), TIMED_SWEEPS)]
+    lidar = LidarSource(T, settings.range_sigma_m, motion, PointTimes.found(some, f"{log.name}: {topic}"))
     where = f"{log.name}: {color[0]}", f"{log.name}: {topic}"
     return Sweeps(lidar, color[1], settings.undistort, where)
 

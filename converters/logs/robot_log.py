@@ -122,6 +122,8 @@ class RobotLog:
             )
         camera, frame = (self.color, self.color_camera), self.log.first(self.depth).header.frame_id
         sweeps = sweeps_of(self.log, camera, self.depth, self.transforms, motion=motion, settings=s)
+        if motion is not None and sweeps.lidar.times.words:
+            self.warnings.append(f"{self.depth}: {sweeps.lidar.times.words}")
         if not s.T_color_depth:
             T = sweeps.lidar.T_camera_lidar
             self.warnings += body_axes_of_camera(self.color_camera.frame_id, frame, T, "T_color_depth")

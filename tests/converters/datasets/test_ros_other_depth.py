@@ -209,6 +209,21 @@ def test_a_lidar_and_what_turns_it(tmp_path: Path) -> None:
     assert errors[""] > 0.002
 
 
+def test_points_in_microseconds_are_taken_so_and_it_is_told(tmp_path: Path) -> None:
+    options = ["depth_from=lidar", "imu=/imu"]
+    depths = []
+    for unit_s in (1.0, 1e-6):
+        log = lidar_log(tmp_path / str(unit_s), unit_s=unit_s)
+        registry.convert("ros", log, tmp_path / f"rec{unit_s}", options=options)
+        recording = Recording(tmp_path / f"rec{unit_s}")
+        stated = [text for text in recording.description["warnings"] if "/points: field time" in text]
+        assert stated == [] or (unit_s < 1 and "taken in us after the stamp" in stated[0])
+        assert len(stated) == (unit_s < 1)
+        with open_rgbd(recording.log("alpha")) as found:
+            depths.append(found.frame(1).depth)
+    np.testing.assert_allclose(depths[1], depths[0], atol=1e-3)
+
+
 def test_logs_without_depth_say_what_could_be_used(tmp_path: Path) -> None:
     with pytest.raises(DuagError, match=r"holds depth images, but there are points \(depth_from=lidar\)"):
         registry.convert("ros", lidar_log(tmp_path), tmp_path / "rec")

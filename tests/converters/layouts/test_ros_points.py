@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from duagc.converters.layouts.ros_points import as_of, points_of
+from duagc.converters.layouts.ros_points import PointTimes, as_of, points_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording.motion import GyroPrior, OdometryPrior
@@ -47,6 +47,7 @@ def cloud(
         row_step=width * step + pad,
         is_bigendian=big,
         data=data.ravel(),
+        header=SimpleNamespace(stamp=SimpleNamespace(sec=1_700_000_000, nanosec=250_000_000)),
     )
 
 
@@ -92,6 +93,77 @@ def test_times_of_the_clock_itself(values: list[float], expected: tuple[float, .
     points, seconds = points_of(message, "here")
     assert len(points) == 4
     np.testing.assert_allclose(seconds, expected, atol=1e-6)
+
+
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SWEEP_S = np.array([0.0, 0.03, 0.07, 0.1])
+
+
+def sweeps_of(name: str, times: Any, kind: str = "f8", starts_s: Any = (1000,) * 8) -> list[Any]:
+    """Sweeps every 0.1 s. times: of the points of one that begins at a time, s."""
+    messages = []
+    for k, start_s in enumerate(starts_s):
+        messages.append(cloud(extra={name: (kind, times(start_s + k * 0.1))}))
+        messages[-1].header.stamp = SimpleNamespace(sec=start_s, nanosec=k * 100_000_000)
+    return messages
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("name", ["time", "t", "offset_time", "timestamp"])
+@pytest.mark.parametrize("clock", ["after", "before", "of the clock", "of a simulated clock"])
+def test_the_unit_of_times_is_what_makes_a_sweep(name: str, unit: str, clock: str) -> None:
+    """Whatever the name; the first sweeps of a simulation are near its time 0."""
+    from_s = {"after": 0.0, "before": -0.1, "of the clock": 1.7e9, "of a simulated clock": 0.0}[clock]
+    is_absolute = "clock" in clock
+    starts_s = [int(from_s) if is_absolute else 0] * 8
+    messages = sweeps_of(
+        name,
+        lambda start_s: (SWEEP_S + (start_s if is_absolute else from_s)) / UNITS[unit],
+        starts_s=starts_s,
+    )
+    times = PointTimes.found(messages, "here")
+    named = {"time": "s", "timestamp": unit}.get(name, "ns")
+    usual = unit == named and (not is_absolute or name == "timestamp")
+    assert (times.words == "") == usual, times.words
+    assert (
+        usual
+        or f"field {name} is taken in {unit} {'of the clock' if is_absolute else 'after'}" in times.words
+    )
+    points, seconds = points_of(messages[3], "here", times)
+    np.testing.assert_array_equal(points, POINTS)
+    np.testing.assert_allclose(seconds, SWEEP_S + (0 if is_absolute else from_s), atol=1e-6)
+
+
+def test_a_part_of_a_sweep_has_the_unit_of_all() -> None:
+    """By itself a short part would be of a larger unit."""
+    messages = sweeps_of("t", lambda _: SWEEP_S * 1e9, "u4")
+    messages[2] = cloud(extra={"t": ("u4", [0, 1_000, 100_000, 999_000])})
+    messages[2].header = messages[3].header
+    seconds = points_of(messages[2], "here", PointTimes.found(messages, "here"))[1]
+    np.testing.assert_allclose(seconds, [0, 1e-6, 1e-4, 999e-6])
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (
+            lambda start_s: SWEEP_S + start_s + 37,
+            "field timestamp goes from 1037 to 1037.8 with stamps from 1000.0",
+        ),
+        (lambda _: [0.0, 1e9, 3e9, 4.2e9], "field timestamp goes from 0 to 4200000000 "),
+        (lambda _: np.zeros(4), "its points have no times, expected a field time, t, "),
+        (lambda _: np.full(4, np.nan), "its points have no times, expected a field time, t, "),
+    ],
+    ids=["another clock", "no unit", "zeros", "nan"],
+)
+def test_times_that_are_not_known_are_told(times: Any, words: str) -> None:
+    """TAI is 37 s before UTC; points are kept, as of the time of their message."""
+    messages = sweeps_of("timestamp", times)
+    found = PointTimes.found(messages, "here")
+    assert f"sweeps hold what the LiDAR moved meanwhile: {words}" in found.words
+    points, seconds = points_of(messages[0], "here", found)
+    np.testing.assert_array_equal(points, POINTS)
+    assert (seconds == 0).all()
 
 
 def test_points_that_are_none_are_left_out() -> None:
