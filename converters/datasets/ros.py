@@ -48,6 +48,7 @@ from duagc.pipeline.recording.register_depth import register_depth
 
 Options = LogOptions
 FARTHEST = np.iinfo(np.uint16).max  # in units of depth
+TRUTH_REMEDY = "--set truth_offset_s=SECONDS to add to the poses' times, or --set time_source=log"
 
 
 def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **options: Any) -> None:
@@ -236,7 +237,8 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         )
     readings.write_until(np.iinfo(np.int64).max)
     if source.truth is not None and without:
-        source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
+        why = source.truth.body.missing_words(list(pairs), source.settings.max_pose_gap_s, TRUTH_REMEDY)
+        source.warnings.append(f"{without} of {len(pairs)} frames have no true pose: {why}")
     if not isinstance(derived, Sweeps):
         with_depth = sum(depth_ns is not None for depth_ns in pairs.values()) - len(cut) - lost
         rows["without_depth"] = empty / max(1, with_depth * source.camera.width * source.camera.height)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -194,6 +195,28 @@ class Poses:
         R = a[:3, :3] @ so3.exp(share * so3.log(a[:3, :3].T @ b[:3, :3]))
         return se3.from_rotation_translation(R, a[:3, 3] + share * (b[:3, 3] - a[:3, 3]))
 
+    def missing_words(self, frames_ns: Sequence[int], max_gap_s: float, remedy: str) -> str:
+        """Why frames have no pose: by the times of both.
+
+        Args:
+            frames_ns: times of the frames, at least one.
+            max_gap_s: between poses that are interpolated.
+            remedy: for poses of another clock.
+        """
+        first, last = min(frames_ns), max(frames_ns)
+        count = int(((self.stamps_ns >= first) & (self.stamps_ns <= last)).sum())
+        ends = (first, last, *self.stamps_ns[[0, -1]].tolist())
+        spans = "images are of {:.3f} to {:.3f} s, poses of {:.3f} to {:.3f} s".format(
+            *(float(t) / NANOSECONDS for t in ends)
+        )
+        text = f"{spans}, {count} of {len(self.stamps_ns)} of them among the images"
+        apart_s = float(np.median(np.diff(self.stamps_ns))) / NANOSECONDS if len(self.stamps_ns) > 1 else 0.0
+        if self.stamps_ns[0] > last or self.stamps_ns[-1] < first:
+            return f"{text}; expected one clock, or {remedy}"
+        if apart_s > max_gap_s:
+            return f"{text}, {apart_s:.3f} s apart; expected less than {max_gap_s:g} s, or --set max_pose_gap_s=SECONDS"
+        return text
+
 
 def frames_of(src: Path, options: SequenceOptions) -> tuple[list[FrameFiles], Poses | None, list[str]]:
     """Frames of a sequence with the pose of its body, the poses, and warnings."""
@@ -233,4 +256,10 @@ def frames_of(src: Path, options: SequenceOptions) -> tuple[list[FrameFiles], Po
         )
         for number, (c, d) in enumerate(pairs)
     ]
+    if poses is not None and all(frame.T_world_camera is None for frame in frames):
+        remedy = f"times of {truth.name} by that of rgb.txt"
+        times = [frame.stamp_ns for frame in frames]
+        warnings.append(
+            f"no image has a true pose: {poses.missing_words(times, options.max_pose_gap_s, remedy)}"
+        )
     return frames, poses, warnings

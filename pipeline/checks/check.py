@@ -23,6 +23,11 @@ from duagc.pipeline.recording.read import LogFile
 __all__ = ["Finding", "Report", "Severity", "check", "check_registration", "format_report"]
 
 _DEFAULT = ChecksConfig()
+_CLOCK_WORDS = (
+    " ppm on that of the headers",
+    " true pose: images are of ",
+    " have none in common with the images",
+)
 
 
 def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = None) -> Report:
@@ -162,10 +167,11 @@ def _check_digest(recording: Recording, robot: str, file: LogFile) -> Iterator[F
 
 
 def _check_clock(recording: Recording, robot: str) -> Iterator[Finding]:
-    """What the converter said about a clock that runs at another rate than the recorder's, and left as it was."""
-    for text in recording.description["warnings"]:
-        if str(text).startswith(f"{robot}: ") and " ppm on that of the headers" in str(text):
-            found, _, expected = str(text).removeprefix(f"{robot}: ").partition("; expected ")
+    """What the converter said about clocks that differ, and left as they were."""
+    others = tuple(f"{other}: " for other in recording.robots if other != robot)
+    for text in map(str, recording.description["warnings"]):
+        if not text.startswith(others) and any(words in text for words in _CLOCK_WORDS):
+            found, _, expected = text.removeprefix(f"{robot}: ").partition("; expected ")
             if expected:
                 yield Finding(
                     Severity.WARNING, "clock", robot, found, expected, "convert it again with that option"
