@@ -210,11 +210,14 @@ class Poses:
             *(float(t) / NANOSECONDS for t in ends)
         )
         text = f"{spans}, {count} of {len(self.stamps_ns)} of them among the images"
-        apart_s = float(np.median(np.diff(self.stamps_ns))) / NANOSECONDS if len(self.stamps_ns) > 1 else 0.0
         if self.stamps_ns[0] > last or self.stamps_ns[-1] < first:
             return f"{text}; expected one clock, or {remedy}"
-        if apart_s > max_gap_s:
-            return f"{text}, {apart_s:.3f} s apart; expected less than {max_gap_s:g} s, or --set max_pose_gap_s=SECONDS"
+        after = np.searchsorted(self.stamps_ns, np.setdiff1d(frames_ns, self.stamps_ns))
+        inner = after[(after > 0) & (after < len(self.stamps_ns))]
+        gaps_s = (self.stamps_ns[inner] - self.stamps_ns[inner - 1]) / NANOSECONDS
+        if len(wide_s := gaps_s[gaps_s > max_gap_s]):
+            text = f"{text}, {len(wide_s)} images between poses that are {np.median(wide_s):.3f} s apart"
+            return f"{text}; expected at most {max_gap_s:g} s, or --set max_pose_gap_s=SECONDS"
         return text
 
 

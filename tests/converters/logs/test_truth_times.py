@@ -58,7 +58,8 @@ def test_poses_of_another_clock_are_named_with_both_spans(tmp_path: Path) -> Non
 def test_poses_that_are_far_apart_are_named_with_their_gap(tmp_path: Path) -> None:
     log = log_of(tmp_path, every=3)
     (words,) = warnings_of(log, tmp_path / "rec")
-    assert "2 of 2 of them among the images, 0.150 s apart; expected less than 0.1 s, or" in words
+    gaps = "2 images between poses that are 0.150 s apart; expected at most 0.1 s, or --set max_pose_gap_s="
+    assert f"2 of 2 of them among the images, {gaps}" in words
     assert warnings_of(log, tmp_path / "wide", "max_pose_gap_s=0.2") == []
 
 
