@@ -124,3 +124,27 @@ def realsense_extrinsics(log: Log, color: str, depth: str, name: str) -> Array |
         m = log.first(topic)
         found.append(pose_matrix(m.translation, m.rotation, f"{name}: {topic}"))
     return found[0] @ se3.inverse(found[1])
+
+
+def stated_unit(log: Log, depth: str, settings: LogOptions) -> LogOptions:
+    """The settings with the unit of depth that a recording by RealSense's own software states, unless they state one.
+
+    Args:
+        log: the log.
+        depth: topic of the depth images.
+        settings: options of the converter.
+    Raises:
+        DuagError: what the log states is no unit.
+    """
+    sensor = depth.removesuffix("/image/data").rpartition("/")[0]
+    named = [f"{sensor}/option/Depth{blank}Units/value" for blank in " _"]  # of older and newer software
+    found = [topic for topic in log.of_type("std_msgs/msg/Float32") if topic in named]
+    if not found or not depth.endswith("/image/data") or "depth_scale" in settings.model_fields_set:
+        return settings
+    topic = found[0]
+    meters = float(f"{log.first(topic).data:.6g}")  # 0.001 is not one of the 32-bit numbers
+    if not 0 < meters < 1:
+        raise DuagError(
+            f"{log.name}: {topic} is {meters:g}, expected meters per unit, or --set depth_scale=METERS"
+        )
+    return settings.model_copy(update={"depth_scale": meters})

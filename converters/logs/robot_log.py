@@ -21,6 +21,7 @@ from duagc.converters.logs.cameras import (
     is_rectified,
     stated,
     stated_camera,
+    stated_unit,
 )
 from duagc.converters.logs.choice import Chooser, video_words
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
@@ -73,6 +74,7 @@ class RobotLog:
             raise DuagError(f"{self.name}: found no topic of images{where}, expected color and depth{video}")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
+        self.settings = s = stated_unit(self.log, self.depth, s)
         color = self._view(self.color, "color_info", chooser)
         self.color_camera = color.camera
         self._motion = MotionReader(

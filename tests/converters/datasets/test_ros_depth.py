@@ -27,6 +27,7 @@ from tests.fixtures.ros_bags import (
     T_COLOR_DEPTH,
     Ros,
     scene,
+    still,
 )
 
 
@@ -214,3 +215,31 @@ def test_an_image_without_a_time_is_left_out(tmp_path: Path) -> None:
         assert log.pairing.pairs[0][0] > START_NS
     warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
     assert any("/camera/color/image_raw: 1 images without a time; left out" in text for text in warnings)
+
+
+@pytest.mark.parametrize(
+    ("options", "unit_m", "name"),
+    [
+        ([], 0.0001, "Depth Units"),
+        ([], 0.0001, "Depth_Units"),
+        (["depth_scale=0.002"], 0.002, "Depth Units"),
+    ],
+)
+def test_the_unit_that_software_of_a_camera_states_counts(
+    tmp_path: Path, options: list[str], unit_m: float, name: str
+) -> None:
+    """Not every RealSense counts millimeters; what the user says goes before it."""
+    r, sensor = Ros(1), "/device_0/sensor_0"
+    rows = still(r, ("/device_0/sensor_1/Color_0/image/data", "c"), (f"{sensor}/Depth_0/image/data", "c"))
+    unit = r.make("std_msgs/msg/Float32", data=np.float32(0.0001))
+    rows.insert(0, (f"{sensor}/option/{name}/value", START_NS, unit))
+    registry.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec", options=options)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        np.testing.assert_allclose(np.unique(log.frame(0).depth), [1000 * unit_m, 2000 * unit_m], rtol=1e-6)
+    unit = r.make("std_msgs/msg/Float32", data=np.float32(0))
+    rows[0] = (rows[0][0], START_NS, unit)
+    if not options:
+        with pytest.raises(
+            DuagError, match="Units/value is 0, expected meters per unit, or --set depth_scale="
+        ):
+            registry.convert("ros", r.write(tmp_path / "none", rows, "plain"), tmp_path / "rec2")
