@@ -32,7 +32,7 @@ from duagc.converters.logs.describe import namespaces
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import Source, pieces_words, sources_of, unread
-from duagc.converters.logs.unmeasured import farthest_measured_m
+from duagc.converters.logs.unmeasured import first_depths, float_unit_m
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
@@ -44,6 +44,7 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.greatest_depth import unmeasured
 from duagc.pipeline.recording.register_depth import register_depth
 
 Options = LogOptions
@@ -174,7 +175,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     if isinstance(derived, Sweeps):
         robot.set_lidar(derived.lidar.T_camera_lidar, derived.lidar.range_sigma_m)
     check = ReprojectionCheck(source.camera, len(pairs), gap)
-    farthest_m = _farthest_m(source)
+    rules = _rules_of_depth(source)
     without = empty = far = lost = 0
     cut: list[UnusableImage] = []
     written: set[int] = set()
@@ -186,7 +187,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
                 partner_ns = pairs[stamp_ns]
                 assert partner_ns is not None  # or there would be nothing to derive depth from
                 return stamp_ns, derived.picture(color, depth, stamp_ns, partner_ns), 0
-            return stamp_ns, *_measured(source, stamp_ns, color, depth, farthest_m=farthest_m)
+            return stamp_ns, *_measured(source, stamp_ns, color, depth, rules=rules)
         except UnusableImage as error:
             return stamp_ns, error, 0
 
@@ -246,31 +247,34 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     return {**rows, **check.result(log, max_ratio), **_truth_lag(source), **drift}
 
 
-def _farthest_m(source: RobotLog) -> float:
-    """Distance from which on depth images say nothing, meters; 0: all depth counts."""
-    if source.settings.farthest_m or source.derived is not None:
-        return source.settings.farthest_m
+def _rules_of_depth(source: RobotLog) -> tuple[float, float]:
+    """Distance from which on depth images say nothing, meters (0: all counts), and meters per unit of floats."""
+    settings = source.settings
+    if source.derived is not None:
+        return settings.farthest_m, 1.0
     held_out = {source.pairs[color] for index, color in enumerate(sorted(source.pairs)) if is_held_out(index)}
-    found_m, share = farthest_measured_m(
-        source.log,
-        source.depth,
-        source.settings.depth_scale,
-        lambda entry: source.time_ns(entry) not in held_out,
-    )
+    images = first_depths(source.log, source.depth, lambda entry: source.time_ns(entry) not in held_out)
+    stated_m = settings.depth_scale if "depth_scale" in settings.model_fields_set else None
+    limit_m, where = FARTHEST * source.depth_scale, f"{source.name}: {source.depth}"
+    unit_m = float_unit_m(images, limit_m, stated_m, where)
+    if settings.farthest_m:
+        return settings.farthest_m, unit_m
+    found_m, share = unmeasured([in_meters(image, settings.depth_scale, unit_m) for image in images])
     if found_m:
         source.warnings.append(
             f"{share:.0%} of {source.depth} is exactly {found_m:.3f} m, far beyond all other: taken for none; "
             "expected 0 where nothing was measured"
         )
-    return found_m
+    return found_m, unit_m
 
 
 def _measured(
-    source: RobotLog, stamp_ns: int, color: Any, depth: Any | None, *, farthest_m: float
+    source: RobotLog, stamp_ns: int, color: Any, depth: Any | None, *, rules: tuple[float, float]
 ) -> tuple[Picture, int]:
-    """A frame, with depth if there is any, and how many pixels are too far away for the log."""
+    """A frame, with depth if there is any, and how many pixels are too far away for the log; rules: of depth."""
     import cv2
 
+    farthest_m, float_unit = rules
     log, maps = source.name, source.color_maps
     where = f"{log}: {source.color} at {stamp_ns} ns"
     data, color_format = color_bytes(color, where)
@@ -294,13 +298,13 @@ def _measured(
         return Picture(data, color_format), 0
     _check_size(where, (values.shape[1], values.shape[0]), source.depth_camera.camera)
     if farthest_m:
-        meters = in_meters(values, source.settings.depth_scale)
+        meters = in_meters(values, source.settings.depth_scale, float_unit)
         values = np.where(meters < farthest_m, values, values.dtype.type(0))
     if source.depth_maps is not None:
         values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
     if source.keeps_depth and values.dtype == np.uint16:
         return Picture(data, color_format, np.asarray(values, dtype=np.uint16)), 0
-    meters = in_meters(values, source.settings.depth_scale)
+    meters = in_meters(values, source.settings.depth_scale, float_unit)
     if source.T_color_depth is not None:
         meters = register_depth(meters, source.depth_camera.camera, source.T_color_depth, source.camera)
     units = np.rint(meters / source.depth_scale)

@@ -228,11 +228,18 @@ def depth_m(message: Any, where: str, scale: float) -> Depth:
     return in_meters(depth_values(message, where), scale)
 
 
-def in_meters(values: NDArray[np.uint16] | Depth, scale: float) -> Depth:
-    """What `depth_values` gives, in meters."""
+def in_meters(values: NDArray[np.uint16] | Depth, scale: float, float_scale: float = 1.0) -> Depth:
+    """What `depth_values` gives, in meters.
+
+    Args:
+        values: integers, or floats.
+        scale: meters per unit of integers.
+        float_scale: meters per unit of floats.
+    """
     if values.dtype == np.uint16:
         return values.astype(np.float32) * np.float32(scale)
-    return values.astype(np.float32, copy=False)
+    floats = values.astype(np.float32, copy=False)
+    return floats if float_scale == 1 else floats * np.float32(float_scale)
 
 
 def depth_values(message: Any, where: str) -> NDArray[np.uint16] | Depth:

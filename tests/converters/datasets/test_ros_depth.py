@@ -243,3 +243,23 @@ def test_the_unit_that_software_of_a_camera_states_counts(
             DuagError, match="Units/value is 0, expected meters per unit, or --set depth_scale="
         ):
             registry.convert("ros", r.write(tmp_path / "none", rows, "plain"), tmp_path / "rec2")
+
+
+def test_depth_of_floats_in_millimeters_is_refused_or_taken_by_its_unit(tmp_path: Path) -> None:
+    """Floats are meters by REP 118; as such nothing of these would be left."""
+    r, logs = Ros(2), {}
+    for per_m in (1, 1000):
+        rows = []
+        for topic, log_ns, message in still(r):
+            if "depth_registered/image" in topic:
+                units = np.frombuffer(bytes(message.data), np.uint16).reshape(48, 64)
+                floats = np.where(units > 1000, units * np.float32(per_m / 1000), np.nan)
+                message = r.image(log_ns, "c", floats.astype(np.float32), "32FC1")
+            rows.append((topic, log_ns, message))
+        logs[per_m] = r.write(tmp_path / str(per_m), rows, "mcap")
+    with pytest.raises(DuagError, match=r"is 32FC1 from 2000 to 2000, expected meters, .* depth_scale=0.001"):
+        registry.convert("ros", logs[1000], tmp_path / "none")
+    for per_m, log in logs.items():  # meters stay meters
+        registry.convert("ros", log, tmp_path / f"rec{per_m}", options=["depth_scale=0.001"])
+        with open_rgbd(tmp_path / f"rec{per_m}" / "alpha.mcap") as found:
+            np.testing.assert_allclose(np.unique(found.frame(0).depth), [0, 2])
