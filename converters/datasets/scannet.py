@@ -21,6 +21,7 @@ from duagc.pipeline.base.files import decode_image, read_bytes, read_text
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 0.001
+OFF_CENTER = 0.25  # share of the side: intrinsics of images that were scaled are farther off
 
 
 class Options(image_folder.LengthOptions):
@@ -78,7 +79,13 @@ def _camera(path: Path, image: Path) -> PinholeCamera:
     pixels = decode_image(read_bytes(image, "an image"), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise DuagError(f"{image}: no decoder reads it, expected an image")
-    return PinholeCamera(pixels.shape[1], pixels.shape[0], K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    height, width = pixels.shape[:2]
+    center = K[0, 2] / width, K[1, 2] / height
+    if not all(0.5 - OFF_CENTER < share < 0.5 + OFF_CENTER for share in center):
+        raise DuagError(
+            f"{path}: center {K[0, 2]:g}, {K[1, 2]:g} px, expected that of images of {width}x{height}, as {image.name}"
+        )
+    return PinholeCamera(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
 def _read_pose(path: Path) -> np.ndarray | None:

@@ -196,6 +196,13 @@ def tear(path: Path) -> None:
     path.write_bytes(data)
 
 
+def halve(folder: Path) -> None:
+    """Images of half the size with the intrinsics of whole ones."""
+    for file in folder.iterdir():
+        image = cv2.imread(str(file))
+        save(file, cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2))[..., ::-1])
+
+
 BROKEN = [
     ("replica", lambda p: (p.parent / "cam_params.json").unlink(), "cam_params.json: not found"),
     ("replica", lambda p: (p / "results" / "depth000001.png").unlink(), "has no partner, expected depth000001"),
@@ -218,6 +225,7 @@ BROKEN = [
     ("icl-nuim", lambda p: (p / "traj0.gt.freiburg").unlink(), "found 0 files *.gt.freiburg"),
     ("icl-nuim", lambda p: edit(p / "traj0.gt.freiburg", lambda t: t[: len(t) // 2].rsplit("\n", 1)[0]), "has no pose"),
     ("scannet", lambda p: (p / "intrinsic" / "intrinsic_depth.txt").write_text("1 2"), "expected 4x4 numbers"),
+    ("scannet", lambda p: halve(p / "color"), "_color.txt: center 161.6, 122.5 px, expected that of images"),
     ("scannet", lambda p: shutil.rmtree(p / "depth"), "depth: no such folder"),
     ("scannetpp", lambda p: shutil.rmtree(p / "dslr" / "undistorted_depths"), "are not shipped"),
     ("scannetpp", lambda p: edit(next(p.rglob("*.json")), lambda t: t.replace("fl_x", "f")), "KeyError 'fl_x'"),
