@@ -35,6 +35,7 @@ class RosCamera:
 
     Attributes:
         fisheye: whether the distortion is that of the equidistant model.
+        frame_id: without the slash that ROS 1 may put before it.
         is_straight: whether it says that there is no distortion, by numbers that are all zero.
     """
 
@@ -53,7 +54,7 @@ class RosCamera:
         )
         if K.size != 9 or P.size not in (0, 12):
             raise DuagError(f"{where}: K and P of {K.size} and {P.size} numbers, expected 9 and 12")
-        model = message.distortion_model
+        model, frame = message.distortion_model, message.header.frame_id.removeprefix("/")
         if rectified and np.any(P):
             fx, cx, fy, cy = P[0], P[2], P[5], P[6]
             D = np.zeros(0)
@@ -80,7 +81,7 @@ class RosCamera:
             (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
         )
         if not np.any(D):
-            return RosCamera(camera, (), False, message.header.frame_id, len(D) > 0)
+            return RosCamera(camera, (), False, frame, len(D) > 0)
         fisheye = model in FISHEYE
         lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
         if not fisheye and model not in POLYNOMIAL:
@@ -90,7 +91,7 @@ class RosCamera:
             raise DuagError(
                 f"{where}: distortion {D.tolist()} of {model!r}, expected {' or '.join(map(str, lengths))} numbers"
             )
-        return RosCamera(camera, tuple(D.tolist()), fisheye, message.header.frame_id)
+        return RosCamera(camera, tuple(D.tolist()), fisheye, frame)
 
     def maps(
         self, onto: PinholeCamera | None = None

@@ -12,7 +12,7 @@ from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.layouts.ros_images import size_of
 from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
-from duagc.converters.logs.frames import pose_matrix
+from duagc.converters.logs.frames import frame_name, pose_matrix
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.robot_writer import check_camera
 from duagc.pipeline.base.arrays import Array
@@ -57,7 +57,7 @@ def stated_camera(text: str, image: Any, where: str) -> RosCamera:
     camera = PinholeCamera(*size_of(image, where), *numbers[:4])
     check_camera(camera, where)
     distortion = tuple(numbers[4:]) if any(numbers[4:]) else ()
-    return RosCamera(camera, distortion, False, image.header.frame_id)
+    return RosCamera(camera, distortion, False, frame_name(image.header.frame_id))
 
 
 class CameraWatch:

@@ -28,7 +28,7 @@ from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
 from duagc.converters.logs.files import Log
-from duagc.converters.logs.frames import Transforms, body_axes_of_camera
+from duagc.converters.logs.frames import Transforms, body_axes_of_camera, frame_name
 from duagc.converters.logs.gather import gathered
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader
 from duagc.converters.logs.options import LogOptions
@@ -155,8 +155,9 @@ class RobotLog:
     def _view(self, topic: str, option: str, chooser: Chooser) -> ImageTopic:
         """An image topic with its camera: as the options state it, else by its CameraInfo."""
         image, where = chooser.images[topic], f"{self.name}: {topic}"
+        frame = frame_name(image.header.frame_id)
         if text := stated(self.settings, option, bool(chooser.infos)):
-            return ImageTopic(topic, image.header.frame_id, "", stated_camera(text, image, where))
+            return ImageTopic(topic, frame, "", stated_camera(text, image, where))
         chosen = chooser.info(option, topic).required(self.log, option)
         try:
             camera = RosCamera.of(self.log.first(chosen), is_rectified(topic), f"{self.name}: {chosen}")
@@ -170,7 +171,7 @@ class RobotLog:
             raise DuagError(
                 f"{where} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in {chosen}"
             )
-        return ImageTopic(topic, image.header.frame_id, chosen, camera)
+        return ImageTopic(topic, frame, chosen, camera)
 
     @cached_property
     def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:

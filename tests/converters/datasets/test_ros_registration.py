@@ -62,10 +62,13 @@ def test_one_camera_info_is_not_that_of_two_cameras(
     assert described(tmp_path / "rec")["robots"]["alpha"]["sensors"]["depth"].endswith("by the converter")
 
 
-def test_the_cameras_of_one_frame_may_share_their_camera_info(tmp_path: Path) -> None:
+@pytest.mark.parametrize("slash", ["", "/"])
+def test_the_cameras_of_one_frame_may_share_their_camera_info(tmp_path: Path, slash: str) -> None:
+    """Drivers of ROS 1 may put a slash before a frame; it is the same one."""
     r = Ros(2)
     infos = {"/camera/color/camera_info": r.info(START_NS, "c", SMALL)}
-    bag = r.write(tmp_path / "bag", still(r, depth=(RAW, "c"), infos=infos), "sqlite3")
+    color = "/camera/color/image_raw", f"{slash}c"
+    bag = r.write(tmp_path / "bag", still(r, color, (RAW, "c"), infos), "sqlite3")
     registry.convert("ros", bag, tmp_path / "rec")
     assert described(tmp_path / "rec")["robots"]["alpha"]["sensors"]["depth"] == "registered"
 
