@@ -18,6 +18,14 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
 MOST_TRIED = 30  # images of a topic that are read to find one that is sound
 VIDEO = ("CompressedVideo", "FFMPEGPacket")  # how the names of schemas of video end
+PACKETS = (
+    "CustomMsg",
+    "VelodyneScan",
+    "PacketMsg",
+    "HesaiScan",
+    "RslidarScan",
+    "NebulaPackets",
+)  # of LiDARs, likewise
 LEFT, RIGHT = ("left", "infra1", "cam0"), ("right", "infra2", "cam1")
 REGISTERED = (
     "aligned_depth_to_color",
@@ -92,6 +100,8 @@ class Chooser:
             others = [t for t, m in self.images.items() if t != left and not is_depth(m)]
             return self._one("depth", [t for t in others if "depth" not in t.lower()], RIGHT, "right")
         if source == "lidar":
+            if not self.clouds:
+                return Choice("", f"no topic holds {POINTS_TYPE}{packet_words(self.log, self.namespace)}")
             return self._one("depth", self.clouds, (), "point", known=self.clouds)
         found = [t for t, m in self.images.items() if is_depth(m)]
         sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
@@ -99,6 +109,8 @@ class Chooser:
         lost = [t for t, m in self.images.items() if "depth" in t.lower() and not is_depth(m)]
         if not choice.topic and not choice.candidates and self.clouds:
             choice = replace(choice, why=f"{choice.why}, but there are points (depth_from=lidar)")
+        elif not choice.topic and not choice.candidates:
+            choice = replace(choice, why=choice.why + packet_words(self.log, self.namespace))
         sides = [
             [t for t in self.images if any(hint in t.lower() for hint in hints)] for hints in (LEFT, RIGHT)
         ]
@@ -159,8 +171,10 @@ class Chooser:
     def _told(self, option: str, known: Sequence[str]) -> Choice:
         wanted = self._wanted[option]
         if wanted not in known:
+            there = self.log.topics.get(wanted)
+            found = f"is {there.type}" if there and there.count else "not found"
             raise DuagError(
-                f"{self.log.name}: {option} topic {wanted} not found, {closest(wanted, known, 'a topic')}"
+                f"{self.log.name}: {option} topic {wanted} {found}, {closest(wanted, known, 'a topic')}"
             )
         return Choice(wanted, "given", tuple(known))
 
@@ -197,6 +211,16 @@ def video_words(log: Log, namespace: str) -> str:
     return (
         f"; {', '.join(found)} is video, which is not read: republish or export it as JPEG, PNG or raw images"
     )
+
+
+def packet_words(log: Log, namespace: str) -> str:
+    """What to add to a complaint that there are no points: topics that hold them as their driver has them."""
+    found = sorted(
+        f"{t.name} ({t.type})"
+        for t in log.topics.values()
+        if t.type.endswith(PACKETS) and t.count and is_below(t.name, namespace)
+    )
+    return f"; {', '.join(found)} is of a driver and not read: republish it as {POINTS_TYPE}" if found else ""
 
 
 def _parts(topic: str) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 from duagc.converters import registry
 from duagc.converters.layouts.ros_camera import RosCamera
@@ -20,7 +21,7 @@ from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, open_rgbd
 from tests.fixtures.lidar_logs import FRAMES, START, lidar_log
-from tests.fixtures.ros_bags import Ros, odometry
+from tests.fixtures.ros_bags import Ros, odometry, still
 from tests.fixtures.s3e import (
     D_LEFT,
     D_RIGHT,
@@ -233,3 +234,31 @@ def test_logs_without_depth_say_what_could_be_used(tmp_path: Path) -> None:
         )
     with pytest.raises(DuagError, match="depth_from"):
         registry.convert("ros", lidar_log(tmp_path / "b"), tmp_path / "rec", options=["depth_from=radar"])
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        ([], "none of /camera/color/image_raw holds depth images; /livox/lidar "),
+        (["depth_from=lidar"], "no topic holds sensor_msgs/msg/PointCloud2; /livox/lidar "),
+        (
+            ["depth_from=lidar", "depth=/livox/lidar"],
+            "no topic holds sensor_msgs/msg/PointCloud2; /livox/lidar ",
+        ),
+        (["depth=/livox/lidar"], "depth topic /livox/lidar is livox_ros_driver2/msg/CustomMsg, expected"),
+    ],
+)
+def test_points_as_a_driver_has_them_are_named(tmp_path: Path, options: list[str], found: str) -> None:
+    r, kind = Ros(2), "livox_ros_driver2/msg/CustomMsg"
+    r.store.register(get_types_from_msg("std_msgs/Header header\nuint64 timebase\nuint32 point_num", kind))
+    rows = [row for row in still(r) if "depth" not in row[0]]
+    sweep = r.make(kind, header=r.header(rows[-1][1], "lidar"), timebase=0, point_num=0)
+    rows.append(("/livox/lidar", rows[-1][1], sweep))
+    log = r.write(tmp_path / "log", rows, "mcap")
+    with pytest.raises(DuagError) as caught:
+        registry.convert("ros", log, tmp_path / "rec", options=options)
+    assert found in str(caught.value)
+    is_told = "(livox_ros_driver2/msg/CustomMsg) is of a driver and not read: republish it as" in str(
+        caught.value
+    )
+    assert is_told == ("is livox" not in found)
