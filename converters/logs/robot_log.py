@@ -28,12 +28,12 @@ from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
 from duagc.converters.logs.files import Log
-from duagc.converters.logs.frames import Transforms, body_axes_of_camera, frame_name
+from duagc.converters.logs.frames import TF_TYPES, Transforms, body_axes_of_camera, frame_name
 from duagc.converters.logs.gather import gathered
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.registration import ImageTopic, check_infos, extrinsics
-from duagc.converters.logs.stamps import sound_stamps
+from duagc.converters.logs.stamps import clock_words, sound_stamps
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
@@ -266,16 +266,25 @@ class RobotLog:
         """Times of the images by topic. Looks through the log once, for all that is to be known before the images."""
         stamps = {self.color: array("q"), self.depth: array("q")}
         delays, recorded = array("q"), array("q")
+        least_ns: dict[str, int] = {}
+
+        def take_stamp(entry: Entry) -> int:
+            stamp_ns = self.time_ns(entry)
+            if stamp_ns:  # else nobody set it: such images are left out
+                delay_ns = entry.log_ns - stamp_ns
+                least_ns[entry.topic] = min(least_ns.get(entry.topic, delay_ns), delay_ns)
+            return stamp_ns
 
         def take_image(entry: Entry) -> None:
-            stamp_ns = self.time_ns(entry)
+            stamp_ns = take_stamp(entry)
             stamps[entry.topic].append(stamp_ns)
-            if stamp_ns:  # else nobody set it: such images are left out
+            if stamp_ns:
                 delays.append(entry.log_ns - stamp_ns)
                 recorded.append(entry.log_ns)
 
         cameras = CameraWatch(self._cameras, self.name)
-        takers: list[tuple[str, Callable[[Entry], None]]] = [*self._motion.take]
+        takers: list[tuple[str, Callable[[Entry], object]]] = [*self._motion.take]
+        takers += [(topic, take_stamp) for topic, _ in takers if self.log.topics[topic].type not in TF_TYPES]
         takers += [(topic, take_image) for topic in stamps]
         takers += [(topic, cameras.see) for topic in self._cameras]
         total = sum(self.log.topics[topic].count for topic in {topic for topic, _ in takers})
@@ -284,6 +293,10 @@ class RobotLog:
             for topic, take in takers:
                 if topic == entry.topic:
                     take(entry)
+        if self.settings.time_source == "header":
+            if self.settings.truth in least_ns:
+                least_ns[self.settings.truth] -= round(self.settings.truth_offset_s * NANOSECONDS)
+            self.warnings += clock_words(least_ns, self.color)
         self._delays_ns = np.array(delays, dtype=np.int64)
         self._image_ns = np.array(recorded, dtype=np.int64) - self._delays_ns
         return stamps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,6 +12,23 @@ from duagc.pipeline.base.errors import DuagError
 MOST_STEPS_BACK = (
     5.0  # intervals of frames that transport may exchange; a clock that was set back goes further
 )
+LONGEST_DELAY_S = 1.0  # between topics: what drivers compute before they publish takes less
+
+
+def clock_words(least_ns: Mapping[str, int], reference: str) -> list[str]:
+    """What to warn of where headers of a topic are of another clock than those of the reference.
+
+    Args:
+        least_ns: by topic, the least time from a message's header to its recording.
+        reference: one of the topics.
+    """
+    own_s = least_ns[reference] / NANOSECONDS if reference in least_ns else 0.0
+    return [
+        f"{topic} is recorded {least / NANOSECONDS:.3f} s after the times of its headers at least, and {reference} "
+        f"{own_s:.3f} s, as if their clocks differ; expected one clock, or --set time_source=log"
+        for topic, least in least_ns.items()
+        if reference in least_ns and abs(least / NANOSECONDS - own_s) > LONGEST_DELAY_S
+    ]
 
 
 def sound_stamps(name: str, topic: str, times: Sequence[int], warnings: list[str]) -> list[int]:

@@ -27,6 +27,7 @@ _CLOCK_WORDS = (
     " ppm on that of the headers",
     " true pose: images are of ",
     " have none in common with the images",
+    " as if their clocks differ",
 )
 
 

@@ -48,6 +48,40 @@ def test_depth_of_another_clock_offers_the_recorders(tmp_path: Path) -> None:
     registry.convert("ros", bag, tmp_path / "rec", options=["time_source=log"])
 
 
+@pytest.mark.parametrize(("depth_s", "imu_s"), [(0, 0), (0.8, 0), (37, 0), (-37, -37), (0, 37)])
+def test_clocks_that_differ_by_less_than_the_log_are_warned_of(
+    tmp_path: Path, depth_s: float, imu_s: float
+) -> None:
+    """TAI is 37 s before UTC: images are paired all the same, each with what was seen half a minute before."""
+    r = Ros(2)
+    rows = [
+        (topic, START_NS + (at_ns - START_NS) * 200, message)  # one image in 10 s
+        for topic, at_ns, message in still(r, frames=8)
+    ]
+    for topic, log_ns, message in rows:
+        by_ns = round(1e9 * depth_s) if topic == DEPTH else 0
+        stamp = message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(log_ns - 30_000_000 + by_ns, 10**9)
+    for k in range(80):
+        at_ns = START_NS + k * 10**9
+        message = imu(r, at_ns - 1_000_000 + imu_s * 10**9, "c", np.array([0.0, 0.0, 0.3]))
+        rows.append(("/imu", at_ns, message))
+    bag = r.write(tmp_path / "bag", sorted(rows, key=lambda row: row[1]), "sqlite3")
+    options = ["imu=/imu", "max_difference_s=5"]
+    registry.convert("ros", bag, tmp_path / "rec", options=options)
+    found = [text for text in warnings_of(tmp_path / "rec") if "as if their clocks differ" in text]
+    late = {DEPTH: depth_s, "/imu": imu_s}
+    wrong = [topic for topic in (DEPTH, "/imu") if abs(late[topic]) > 1]
+    assert sorted(text.split()[1] for text in found) == wrong, found
+    least = 0.03 if DEPTH in wrong else 0.001
+    assert not wrong or f"recorded {least - late[wrong[0]]:.3f} s after the times of its headers" in " ".join(
+        found
+    )
+    if found:
+        registry.convert("ros", bag, tmp_path / "log", options=[*options, "time_source=log"])
+        assert not [text for text in warnings_of(tmp_path / "log") if "clock" in text]
+
+
 def test_depth_before_the_first_color_keeps_its_time_from_zero(tmp_path: Path) -> None:
     r = Ros(2)
     bag = r.write(tmp_path / "bag", moved_depth(r, -15_000_000), "sqlite3")

@@ -45,11 +45,16 @@ def test_poses_of_another_clock_are_named_with_both_spans(tmp_path: Path) -> Non
         f"images are of {begin:.3f} to {end:.3f} s, poses of 1000.050 to 1000.200 s, 0 of {FRAMES}" in words
     )
     assert "expected one clock, or --set truth_offset_s=SECONDS to add to the poses' times" in words
-    (finding,) = [f for f in check.check(tmp_path / "rec").findings if f.check == "clock"]
-    assert finding.severity is check.Severity.WARNING
-    assert f"{finding.found}; expected {finding.expected}" in words
+    found = [f for f in check.check(tmp_path / "rec").findings if f.check == "clock"]
+    assert all(finding.severity is check.Severity.WARNING for finding in found)
+    assert [f"{finding.found}; expected {finding.expected}" in words for finding in found] == [False, True]
+    assert found[0].found.startswith(
+        f"/odom is recorded {UPTIME_NS / 1e9:.3f} s after the times of its headers"
+    )
     offset = f"truth_offset_s={UPTIME_NS / 1e9}"
     assert warnings_of(log, tmp_path / "shifted", offset) == []
+    stated = json.loads((tmp_path / "shifted" / "recording.json").read_text())["warnings"]
+    assert not [text for text in stated if "clock" in text]
     (words,) = warnings_of(log, tmp_path / "recorded", "time_source=log")
     assert f"1 of {FRAMES} frames" in words
     assert f"poses of {begin:.3f}" in words
