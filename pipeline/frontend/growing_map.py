@@ -6,9 +6,6 @@ tile removes them for want of contribution, and the final optimization leaves th
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -16,14 +13,13 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.geometry.view_extent import radii_m
 from duagc.pipeline.kernels import CompiledAdam, Gradients
-from duagc.pipeline.kernels.training import step_rows
+from duagc.pipeline.kernels.training import ScaleLimits, step_rows
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.optimizer import TRAINED
 
 Indices = NDArray[np.int64]
-TakeStep = Callable[[Gradients, Gaussians, CompiledAdam], Gaussians]
 FADING = 0.9
 """Share of its last contribution that a Gaussian keeps where it is not measured again."""
 
@@ -183,22 +179,30 @@ class GrowingMap:
         """
         return Gaussians.concatenate([self.gaussians.select(rows) for rows in (guests, self._own)])
 
-    def step(self, guests: Indices, gradients: Gradients, take: TakeStep, *, keep_guests: bool) -> None:
+    def step(
+        self,
+        guests: Indices,
+        gradients: Gradients,
+        rates: LearningRates,
+        *,
+        limits: ScaleLimits,
+        keep_guests: bool,
+    ) -> None:
         """Take an optimization step of what a view may see, in place.
 
         Args:
             guests: rows [m] of the guests that it may see.
             gradients: of a loss by `seen_with(guests)`.
-            take: gives Gaussians after the step, from their gradients, them and the state of their optimizer.
+            rates: step lengths.
+            limits: of the log-scales.
             keep_guests: whether guests stay as they are.
         """
-        count = len(guests)
-        parts: list[tuple[slice | Indices, slice]] = [(self._own, slice(count, None))]
-        if count and not keep_guests:
-            parts.append((guests, slice(count)))
-        for rows, part in parts:
-            of_rows = {name: np.ascontiguousarray(getattr(gradients, name)[part]) for name in TRAINED}
-            step_rows(self.gaussians, self.adam, rows, partial(take, replace(gradients, **of_rows)))
+        rows = np.arange(self.guests, len(self))
+        if keep_guests:
+            gradients = gradients.of_rows(slice(len(guests), None))
+        else:
+            rows = np.concatenate([guests, rows])
+        step_rows(self.gaussians, self.adam, rows, gradients=gradients, rates=rates, limits=limits)
 
     @property
     def _own(self) -> slice:

@@ -18,16 +18,20 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.config.mapping import MappingConfig
-from duagc.pipeline.config.training import DepthKind, LearningRates
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.view_poses import PoseSteps
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
+from duagc.pipeline.kernels import LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
-from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView, step_rows
-from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.kernels.training import (
+    ScaleLimits,
+    TrainingStep,
+    TrainingView,
+    step_rows,
+)
 from duagc.pipeline.splat.map_cells import MapCells
 from duagc.pipeline.splat.optimizer import smoothstep_decay
 
@@ -151,8 +155,8 @@ class JointTraining:
             pose=moves,
             closing=looked_at.closing,
         )
-        take = partial(self._stepped, gradients, rates=self._config.rates.times(share))
-        step_rows(whole.gaussians, whole.adam, rows, take)
+        rates = self._config.rates.times(share)
+        step_rows(whole.gaussians, whole.adam, rows, gradients=gradients, rates=rates, limits=self._limits)
         if moves:
             assert gradients.pose is not None  # it was asked for
             tangent = self._pose_steps.step(chosen, gradients.pose, self._config.pose_rate * share)
@@ -161,8 +165,3 @@ class JointTraining:
 
     def _state(self, cells: MapCells, whole: GrowingMap) -> tuple[Any, ...]:
         return cells, self._pose_steps.state(), self._T_map_camera, self._losses, whole.state()
-
-    def _stepped(
-        self, gradients: Gradients, gaussians: Gaussians, adam: CompiledAdam, *, rates: LearningRates
-    ) -> Gaussians:
-        return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, limits=self._limits)

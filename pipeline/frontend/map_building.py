@@ -17,7 +17,6 @@ from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
-from duagc.pipeline.base.shelf import SHELF, SWEEP_AFTER
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.growing_map import GrowingMap
@@ -175,8 +174,6 @@ class MapBuilder:
                 add = partial(mapper.add_keyframe, iterations=steps[k])
                 stats = self._with_images(add, k)
                 updates.append(stats.message(self._keyframes[k], self.name, len(self._whole) + stats.total))
-                if len(updates) % SWEEP_AFTER == 0:
-                    SHELF.sweep(heap=True)
                 self._checkpoints.at(
                     part,
                     len(updates),
@@ -331,7 +328,7 @@ class MapBuilder:
     def _posed(self, frame_index: int, T_map_tracked: Array) -> PosedRgbd:
         """A frame at its pose before refinement, by which it is known what moves."""
         frame = self.log.frame(frame_index)
-        mask = self._free.usable(frame.usable_depth, T_map_tracked, frame.mask)
+        mask = self._free.usable(frame.usable_depth, T_map_tracked, frame.mask, index=frame_index)
         return PosedRgbd(
             frame.color,
             masked_depth(frame.depth, mask),

@@ -33,14 +33,11 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.kernels import (
-    CompiledAdam,
-    Gradients,
     LossWeights,
 )
 from duagc.pipeline.kernels.sparse_steps import EVERYTHING, LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep
 from duagc.pipeline.messages import Keyframe, MapUpdate
-from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import smoothstep_decay
 
 MANY_VIEWS = 16
@@ -357,22 +354,14 @@ class Mapper(MapContent):
             pose=pose_step is not None,
             closing=looked_at.closing,
         )
-        take = partial(self._stepped, rates=rates)
         if self._map.guests:
-            self._map.step(self._guests(view), gradients, take, keep_guests=keep_guests)
+            guests = self._guests(view)
+            self._map.step(guests, gradients, rates, limits=self._limits, keep_guests=keep_guests)
         else:
-            self._map.gaussians = take(gradients, self._map.gaussians, self._map.adam)
+            self._map.gaussians = self._step.stepped(
+                self._map.gaussians, gradients, adam=self._map.adam, rates=rates, limits=self._limits
+            )
         if pose_step is not None:
             assert gradients.pose is not None  # it was asked for
             view.T_map_camera = view.T_map_camera @ se3.exp(pose_step(gradients.pose))
         return loss.value
-
-    def _stepped(
-        self,
-        gradients: Gradients,
-        gaussians: Gaussians,
-        adam: CompiledAdam,
-        *,
-        rates: LearningRates,
-    ) -> Gaussians:
-        return self._step.stepped(gaussians, gradients, adam=adam, rates=rates, limits=self._limits)

@@ -12,7 +12,6 @@ before: what is learned here comes from the same pixels and is not counted again
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,12 @@ from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, SparseSteps
-from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView, step_rows
+from duagc.pipeline.kernels.training import (
+    ScaleLimits,
+    TrainingStep,
+    TrainingView,
+    step_rows,
+)
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.map_cells import MapCells
 from duagc.pipeline.splat.optimizer import TRAINED, smoothstep_decay
@@ -138,36 +142,31 @@ class _Training:
 
     def step(self, view: PosedRgbd, looked_at: LookedAt, rates: LearningRates) -> None:
         """Take a step on a view."""
-        take = partial(self._stepped, looked_at=looked_at, view=view, rates=rates)
+        image = looked_at.of(TrainingView.of(view, self._huber_m))
         if self._cells is None:
-            self.gaussians = take(self.gaussians, self._adam, floor=self._floor, trained=self._trained)
+            self.gaussians = self._stepped(image, looked_at.closing, rates)
             return
         rows = self._cells.seen(view.depth_m, view.T_world_camera, self._camera)
-        trained = None if self._trained is None else self._trained[rows]
-        take = partial(take, floor=self._floor[rows], trained=trained)
-        step_rows(self.gaussians, self._adam, rows, take)
+        seen = self.gaussians.select(rows)
+        _, gradients = self._take.gradients(seen, self._camera, image, closing=looked_at.closing)
+        if self._trained is not None:
+            chosen = np.flatnonzero(self._trained[rows])
+            rows, gradients = rows[chosen], gradients.of_rows(chosen)
+        limits = ScaleLimits(self._floor)
+        step_rows(self.gaussians, self._adam, rows, gradients=gradients, rates=rates, limits=limits)
 
-    def _stepped(
-        self,
-        gaussians: Gaussians,
-        adam: CompiledAdam,
-        *,
-        floor: NDArray[np.float32],
-        trained: NDArray[np.bool_] | None,
-        view: PosedRgbd,
-        looked_at: LookedAt,
-        rates: LearningRates,
-    ) -> Gaussians:
+    def _stepped(self, image: TrainingView, closing: float, rates: LearningRates) -> Gaussians:
+        """The whole map after a step."""
         stepped, _ = self._take(
-            gaussians,
+            self.gaussians,
             self._camera,
-            looked_at.of(TrainingView.of(view, self._huber_m)),
-            adam=adam,
+            image,
+            adam=self._adam,
             rates=rates,
-            limits=ScaleLimits(floor),
-            closing=looked_at.closing,
+            limits=ScaleLimits(self._floor),
+            closing=closing,
         )
-        return stepped if trained is None else _where(trained, stepped, gaussians)
+        return stepped if self._trained is None else _where(self._trained, stepped, self.gaussians)
 
 
 def _where(chosen: NDArray[np.bool_], a: Gaussians, b: Gaussians) -> Gaussians:

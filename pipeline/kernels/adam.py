@@ -50,30 +50,52 @@ class CompiledAdam(Adam):
         _raster.adam(self.isa, *arguments)
         return gaussians.replace(**dict(zip(names, out, strict=True)))
 
-    def part(self, rows: slice | NDArray[np.int64]) -> CompiledAdam:
-        """The state of some Gaussians: of a slice on the same memory, of indices a copy.
+    def step_rows(
+        self,
+        gaussians: Gaussians,
+        rows: NDArray[np.int64],
+        gradients: GaussianGradients,
+        rates: LearningRates,
+        *,
+        least: NDArray[np.float32],
+        limits: tuple[float, float],
+    ) -> None:
+        """A step of some Gaussians in place, and what is beyond the limits is put there.
 
         Args:
-            rows: of the Gaussians.
+            gaussians: all of them; those of the rows are changed.
+            rows: [m], each once.
+            gradients: [m] by these.
+            rates: step lengths.
+            least: of the log-scales, [n, 3] or [1].
+            limits: the greatest log-scale, and the largest opacity logit of either sign.
         """
-        part = CompiledAdam(isa=self.isa, threads=self.threads)
-        first, second = (
-            {name: of[rows] for name, of in all_of.items()} for all_of in (self._first, self._second)
+        if len(gaussians) != len(self):
+            raise ValueError(f"gaussians are {len(gaussians)}, expected {len(self)}, as many as have a state")
+        if len(rows) and (rows.min() < 0 or rows.max() >= len(self)):
+            raise ValueError(f"rows are {rows.min()} to {rows.max()}, expected 0 to {len(self) - 1}")
+        if least.shape not in ((1,), gaussians.log_scales.shape):
+            raise ValueError(
+                f"least has shape {least.shape}, expected (1,) or {gaussians.log_scales.shape}, that of the log-scales"
+            )
+        names = list(self._first)
+        values = [getattr(gaussians, name) for name in names]
+        for name, value in zip(names, values, strict=True):
+            _check_gradient(name, getattr(gradients, name), (len(rows), *value.shape[1:]))
+            for array in (value, self._first[name], self._second[name]):
+                _check_state(array, np.float32)
+        _check_state(self._steps, np.int32)
+        arrays = (
+            values,
+            [getattr(gradients, name) for name in names],
+            [self._first[name] for name in names],
+            [self._second[name] for name in names],
         )
-        part.go_on((first, second, self._steps[rows], self._corrections))
-        return part
-
-    def put(self, rows: NDArray[np.int64], part: CompiledAdam) -> None:
-        """Take back the state of some Gaussians.
-
-        Args:
-            rows: of the Gaussians, as of `part`.
-            part: that `part` gave, some steps later.
-        """
-        first, second, steps, _ = part.state()
-        for name in first:
-            self._first[name][rows], self._second[name][rows] = first[name], second[name]
-        self._steps[rows] = steps
+        step_lengths = np.array([getattr(rates, name) for name in names], np.float32)
+        touched_by = (gradients.colors, gradients.opacity_logits)
+        clipped = (gaussians.log_scales, gaussians.opacity_logits, least, np.array(limits, np.float32))
+        arguments = (*arrays, step_lengths, _CONSTANTS, *touched_by, self._steps, self._corrections, *clipped)
+        _raster.adam_rows(self.isa, rows, *arguments, operator.index(self.threads))
 
 
 def _check_state(array: NDArray[np.generic], dtype: type[np.generic]) -> None:

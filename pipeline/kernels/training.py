@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,7 +19,6 @@ from duagc.pipeline.kernels.rasterizer import Rasterizer
 from duagc.pipeline.kernels.types import Gradients, LossWeights, ViewLoss
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.losses import depth_certainty
-from duagc.pipeline.splat.optimizer import TRAINED
 
 Image = NDArray[np.float32]
 NO_LIMIT = np.float32(np.inf)
@@ -217,20 +215,22 @@ class TrainingStep:
 def step_rows(
     gaussians: Gaussians,
     adam: CompiledAdam,
-    rows: slice | NDArray[np.int64],
-    take: Callable[[Gaussians, CompiledAdam], Gaussians],
+    rows: NDArray[np.int64],
+    *,
+    gradients: Gradients,
+    rates: LearningRates,
+    limits: ScaleLimits,
 ) -> None:
-    """Take a step of some Gaussians in place.
+    """`TrainingStep.stepped` of some Gaussians in place; none is copied.
 
     Args:
         gaussians: of which some are changed.
         adam: state of the optimization of all of them; changed.
-        rows: which.
-        take: gives these after the step, from what they are and the state of their optimization.
+        rows: [m], which, each once.
+        gradients: [m], of the loss by these.
+        rates: step lengths.
+        limits: of the log-scales.
     """
-    of_rows = adam.part(rows)
-    stepped = take(gaussians.select(rows), of_rows)
-    for name in TRAINED:
-        getattr(gaussians, name)[rows] = getattr(stepped, name)
-    if not isinstance(rows, slice):
-        adam.put(rows, of_rows)
+    least = np.atleast_1d(np.asarray(limits.least, np.float32))
+    of_all = (float(limits.greatest), LARGEST_LOGIT)
+    adam.step_rows(gaussians, rows, gradients, rates, least=least, limits=of_all)

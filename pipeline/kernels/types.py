@@ -59,6 +59,20 @@ class Gradients:
     pose: NDArray[np.float64] | None = None
     fisher_diagonal: NDArray[np.floating] | None = None
 
+    def of_rows(self, rows: slice | NDArray[np.int64]) -> Gradients:
+        """Derivatives by some of the Gaussians alone.
+
+        Args:
+            rows: of these.
+        """
+        return Gradients(
+            self.means[rows],
+            self.quats_wxyz[rows],
+            self.log_scales[rows],
+            self.colors[rows],
+            self.opacity_logits[rows],
+        )
+
 
 class FisherSums:
     """Information of n Gaussians, summed over the views added so far (method section 2, `gauss_newton`).

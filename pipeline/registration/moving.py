@@ -7,6 +7,7 @@ region must be of some size. What moves by less than the gate, or does not move 
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,7 @@ class FreeSpace:
         for _ in range(config.halvings):
             self._small = self._small.halved()
         self._views: list[_View] = []
+        self._known: dict[tuple[int, bytes], bytes | None] = {}
 
     def add(self, depth_m: Image, T_map_camera: Array) -> None:
         """Take a view.
@@ -55,6 +57,7 @@ class FreeSpace:
             depth_m: [h, w], meters, 0 = unknown or masked.
             T_map_camera: [4, 4].
         """
+        self._known = {}
         if self.config.enabled:
             self._views.append(SHELF.put(self._view(depth_m, T_map_camera)))
 
@@ -85,18 +88,38 @@ class FreeSpace:
         found[v, u] = (through >= self.config.min_views) & (through > there)
         return self._regions(found)
 
-    def usable(self, depth_m: Image, T_map_camera: Array, mask: Mask | None) -> Mask | None:
+    def usable(
+        self, depth_m: Image, T_map_camera: Array, mask: Mask | None, *, index: int | None = None
+    ) -> Mask | None:
         """The pixels of a mask that show nothing that moved, bool [h, w]; None = all.
 
         Args:
             depth_m: [h, w], meters, 0 = unknown or masked.
             T_map_camera: [4, 4].
             mask: bool [h, w]; None = all.
+            index: of the frame: what moves in it at this pose is kept until a view is added; None: it is not kept.
         """
-        moving = self.moving(depth_m, T_map_camera) if self.config.enabled else np.zeros(1, bool)
-        if not moving.any():
+        if not self.config.enabled:
+            return mask
+        moving = self._moving(depth_m, T_map_camera, index)
+        if moving is None:
             return mask
         return ~moving if mask is None else mask & ~moving
+
+    def _moving(self, depth_m: Image, T_map_camera: Array, index: int | None) -> Mask | None:
+        """What moves in a frame; None: nothing."""
+        key = None if index is None else (index, np.asarray(T_map_camera, dtype=np.float64).tobytes())
+        if key is not None and key in self._known:
+            packed = self._known[key]
+            if packed is None:
+                return None
+            bits = np.unpackbits(np.frombuffer(zlib.decompress(packed), np.uint8), count=depth_m.size)
+            return bits.reshape(depth_m.shape).astype(bool)
+        moving = self.moving(depth_m, T_map_camera)
+        found = moving if moving.any() else None
+        if key is not None:
+            self._known[key] = None if found is None else zlib.compress(np.packbits(found).tobytes(), 1)
+        return found
 
     def _view(self, depth_m: Image, T_map_camera: Array) -> _View:
         known = depth_m > 0

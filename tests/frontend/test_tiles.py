@@ -178,7 +178,7 @@ def test_a_step_of_what_a_view_sees_is_that_of_all(keep_guests: bool) -> None:
 
     for _ in range(3):
         _, gradients = step.gradients(part.seen_with(seen), CAMERA, view)
-        part.step(seen, gradients, take, keep_guests=keep_guests)
+        part.step(seen, gradients, config.rates, limits=limits, keep_guests=keep_guests)
         _, gradients = step.gradients(maps[1].gaussians, CAMERA, view)
         for array in (gradients.colors, gradients.opacity_logits):
             array[: count if keep_guests else 0] = 0

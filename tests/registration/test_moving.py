@@ -1,5 +1,7 @@
 """What moved is found where others looked through it, and a rigid room is left alone."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -87,3 +89,28 @@ def test_no_depth_is_nothing() -> None:
     free, _, _ = scene([ball_at(k) for k in range(5)])
     free.add(np.zeros((CAMERA.height, CAMERA.width), np.float32), POSES[0] @ se3.exp(np.full(6, 0.01)))
     assert not free.moving(np.zeros((CAMERA.height, CAMERA.width), np.float32), POSES[1]).any()
+
+
+def test_what_moves_in_a_frame_is_known_until_a_view_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    free, depths, _ = scene([ball_at(k) for k in range(5)])
+    still, mask = render(POSES[0])[1], np.ones((CAMERA.height, CAMERA.width), bool)
+    frames = [*zip(depths, POSES, strict=True), (still, POSES[0] @ se3.exp(np.full(6, 0.001)))]
+    expected = [free.usable(depth, T, mask) for depth, T in frames]
+    assert expected[-1] is mask
+    assert all(found is not None and not found.all() for found in expected[:-1])
+    counted = Counter[str]()
+    plain = FreeSpace.moving
+
+    def moving(self: FreeSpace, depth_m: np.ndarray, T_map_camera: np.ndarray) -> np.ndarray:
+        counted["moving"] += 1
+        return plain(self, depth_m, T_map_camera)
+
+    monkeypatch.setattr(FreeSpace, "moving", moving)
+    for _ in range(3):
+        for index, ((depth, T), usable) in enumerate(zip(frames, expected, strict=True)):
+            assert np.array_equal(free.usable(depth, T, mask, index=index), usable)
+    assert counted["moving"] == len(frames)
+    free.usable(depths[0], POSES[0] @ se3.exp(np.full(6, 0.01)), mask, index=0)  # at another pose
+    free.add(depths[0], POSES[0])
+    free.usable(depths[0], POSES[0], mask, index=0)
+    assert counted["moving"] == len(frames) + 2

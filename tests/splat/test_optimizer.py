@@ -8,6 +8,7 @@ import pytest
 
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.kernels import CompiledAdam, Gradients, available_isas
+from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, step_rows
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, Adam, smoothstep_decay
 
@@ -163,8 +164,66 @@ def test_rates_fall_from_one_to_the_last_and_never_rise() -> None:
     assert smoothstep_decay(0, 1, 0.03) == 1.0
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("isa", available_isas())
+@pytest.mark.parametrize("of_each", [False, True])
+def test_a_step_of_rows_in_place_is_that_of_all(threads: int, isa: str, of_each: bool) -> None:
+    n = 400
+    random = np.random.default_rng(2)
+    least = np.float32(-1.5) if not of_each else random.uniform(-2, -1, (n, 3)).astype(np.float32)
+    whole, rows = some(n), random.permutation(n)[:231]
+    whole = whole.replace(opacity_logits=np.where(rows[7] == np.arange(n), 9, whole.opacity_logits))
+    parts, adam, of_parts = whole.select(np.arange(n)), CompiledAdam(n, isa), CompiledAdam(n, isa, threads)
+    for k in range(3):
+        g = gradients(n, k)
+        untouched = random.random(n) < 0.3
+        for array in (g.colors, g.opacity_logits):
+            array[untouched] = 0
+        taken = CompiledAdam(isa=isa)
+        taken.go_on(adam.state())
+        taken.select(rows)
+        limits = ScaleLimits(least[rows] if of_each else least, np.float32(1.5))
+        stepped = TrainingStep.stepped(
+            whole.select(rows), g.of_rows(rows), adam=taken, rates=LearningRates(), limits=limits
+        )
+        for name in NAMES:
+            getattr(whole, name)[rows] = getattr(stepped, name)
+            for of, state in zip(adam.state()[:2], taken.state()[:2], strict=True):
+                of[name][rows] = state[name]
+        adam.state()[2][rows] = taken.state()[2]
+        limits = ScaleLimits(least, np.float32(1.5))
+        step_rows(parts, of_parts, rows, gradients=g.of_rows(rows), rates=LearningRates(), limits=limits)
+        for name in NAMES:
+            assert np.array_equal(getattr(parts, name), getattr(whole, name))
+            for a, b in zip(of_parts.state()[:2], adam.state()[:2], strict=True):
+                assert np.array_equal(a[name], b[name])
+        assert np.array_equal(of_parts.state()[2], adam.state()[2])
+    assert np.abs(parts.opacity_logits[rows]).max() <= 6
+    assert (parts.log_scales[rows] <= 1.5).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [([-1, 2], "rows are -1 to 2, expected 0 to 5"), ([0, 6], "rows are 0 to 6, expected 0 to 5")],
+)
+def test_rows_that_are_none_are_refused(rows: list[int], message: str) -> None:
+    limits = ScaleLimits(np.float32(-7))
+    with pytest.raises(ValueError, match=message):
+        step_rows(
+            some(6),
+            CompiledAdam(6),
+            np.array(rows),
+            gradients=gradients(2, 0),
+            rates=LearningRates(),
+            limits=limits,
+        )
+
+
 def test_a_state_that_would_be_changed_in_a_copy_is_refused() -> None:
     gaussians, adam = some(6), CompiledAdam(6)
-    every_second = adam.part(slice(None, None, 2))
+    every_second = CompiledAdam()
+    first, second, steps, corrections = adam.state()
+    strided = [{name: array[::2] for name, array in of.items()} for of in (first, second)]
+    every_second.go_on((*strided, steps[::2], corrections))
     with pytest.raises(ValueError, match="expected contiguous"):
         every_second.step(gaussians.select(slice(None, None, 2)), gradients(3, 0), LearningRates())

@@ -11,12 +11,12 @@ using namespace raster;
 constexpr size_t ADAM_ROWS = 16;  // Gaussians at a time: often none of so few was touched
 
 // Counts the step of every Gaussian that the view touched; its bias correction, or 0 if it was not touched.
-inline bool count_steps(const AdamStep& step, size_t begin, size_t end, float* correction) {
+inline bool count_steps(const AdamStep& step, const int64_t* rows, size_t begin, size_t end, float* correction) {
     bool any = false;
     for (size_t row = begin; row < end; row++) {
         const float* color = step.d_colors + 3 * row;
         const bool touched = step.d_opacity_logits[row] != 0.0f || color[0] != 0.0f || color[1] != 0.0f || color[2] != 0.0f;
-        int32_t& count = step.steps[row];
+        int32_t& count = step.steps[rows ? rows[row] : static_cast<int64_t>(row)];
         if (touched && count < step.longest) count++;
         correction[row - begin] = touched ? step.corrections[count - 1] : 0.0f;
         any |= touched;
@@ -59,7 +59,7 @@ static void adam(const AdamStep& step, int threads) {
         const size_t begin = static_cast<size_t>(group) * ADAM_ROWS;
         const size_t end = begin + ADAM_ROWS < step.count ? begin + ADAM_ROWS : step.count;
         float correction[ADAM_ROWS];
-        const bool any = count_steps(step, begin, end, correction);
+        const bool any = count_steps(step, nullptr, begin, end, correction);
         for (const AdamArray& array : step.arrays) {
             if (!any)
                 __builtin_memcpy(array.out + begin * array.width, array.values + begin * array.width,
@@ -70,6 +70,59 @@ static void adam(const AdamStep& step, int threads) {
                 step_array<3>(array, step.constants, begin, end, correction);
             else
                 step_array<4>(array, step.constants, begin, end, correction);
+        }
+    }
+}
+
+template <size_t WIDTH>
+inline void step_rows(const AdamArray& array, const AdamConstants& constants, const int64_t* rows, size_t begin, size_t end,
+                      const float* correction) {
+    constexpr size_t MOST = ADAM_ROWS * WIDTH;
+    float of_element[MOST], values[MOST], first[MOST], second[MOST], out[MOST];
+    for (size_t row = begin; row < end; row++) {
+        const size_t from = static_cast<size_t>(rows[row]) * WIDTH, to = (row - begin) * WIDTH;
+        for (size_t k = 0; k < WIDTH; k++) {
+            of_element[to + k] = correction[row - begin];
+            values[to + k] = array.values[from + k];
+            first[to + k] = array.first[from + k], second[to + k] = array.second[from + k];
+        }
+    }
+    step_elements((end - begin) * WIDTH, constants, array.rate, of_element, values, array.gradients + begin * WIDTH, first, second, out);
+    for (size_t row = begin; row < end; row++) {
+        const size_t to = static_cast<size_t>(rows[row]) * WIDTH, from = (row - begin) * WIDTH;
+        for (size_t k = 0; k < WIDTH; k++) {
+            array.out[to + k] = out[from + k];
+            array.first[to + k] = first[from + k], array.second[to + k] = second[from + k];
+        }
+    }
+}
+
+inline float clipped(float value, float least, float greatest) {
+    return value < least ? least : value > greatest ? greatest : value;
+}
+
+static void adam_rows(const AdamStep& step, const AdamRows& some, int threads) {
+    const int groups = static_cast<int>((step.count + ADAM_ROWS - 1) / ADAM_ROWS);
+#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
+    for (int group = 0; group < groups; group++) {
+        const size_t begin = static_cast<size_t>(group) * ADAM_ROWS;
+        const size_t end = begin + ADAM_ROWS < step.count ? begin + ADAM_ROWS : step.count;
+        float correction[ADAM_ROWS];
+        if (count_steps(step, some.rows, begin, end, correction))
+            for (const AdamArray& array : step.arrays) {
+                if (array.width == 1)
+                    step_rows<1>(array, step.constants, some.rows, begin, end, correction);
+                else if (array.width == 3)
+                    step_rows<3>(array, step.constants, some.rows, begin, end, correction);
+                else
+                    step_rows<4>(array, step.constants, some.rows, begin, end, correction);
+            }
+        for (size_t row = begin; row < end; row++) {
+            const size_t at = static_cast<size_t>(some.rows[row]);
+            float &logit = some.opacity_logits[at], *scales = some.log_scales + 3 * at;
+            for (size_t k = 0; k < 3; k++)
+                scales[k] = clipped(scales[k], some.least_of_each ? some.least[3 * at + k] : some.least[0], some.greatest);
+            logit = clipped(logit, -some.largest_logit, some.largest_logit);
         }
     }
 }

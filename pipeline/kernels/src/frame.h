@@ -229,6 +229,14 @@ struct AdamStep {
     const float* corrections;                  // [longest], of the bias after 1, 2, ... steps
     int32_t longest;
 };
+// Of a step of some rows, in place.
+struct AdamRows {
+    const int64_t* rows;  // [count], each once; gradients have a row for each, everything else those of all Gaussians
+    float *log_scales, *opacity_logits;
+    const float* least;   // of the log-scales: of each Gaussian [n, 3], or one
+    bool least_of_each;
+    float greatest, largest_logit;
+};
 
 enum class Status { ok, bad_gaussians, bad_first_image, bad_second_image, bad_third_image, too_many_intersections };
 
@@ -254,6 +262,7 @@ struct Kernels {
     Status (*full_fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, double* information);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);
     void (*adam)(const AdamStep&, int threads);
+    void (*adam_rows)(const AdamStep&, const AdamRows&, int threads);
     double (*fma_rate)(int threads, double seconds);                              // of the machine, GFLOP/s
     void (*bandwidth)(int threads, double seconds, double* read, double* copied);  // GB/s
 };

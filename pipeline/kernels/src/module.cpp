@@ -80,23 +80,47 @@ static nb::tuple bandwidth(int threads, double seconds) {
     return nb::make_tuple(read, copied);
 }
 
-// Shapes are checked by pipeline.kernels.optimizer, the only caller. The lists have an array for each kind of parameter.
-static void adam(const std::string& isa, const std::vector<Inputs>& values, const std::vector<Inputs>& gradients,
-                 const std::vector<Floats>& first, const std::vector<Floats>& second, const std::vector<Floats>& out, const Inputs& rates,
-                 const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits, const Array<int32_t>& steps,
-                 const Inputs& corrections, int threads) {
+static AdamStep adam_step(const std::vector<Inputs>& gradients, const std::vector<Floats>& first, const std::vector<Floats>& second,
+                          const Inputs& rates, const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits,
+                          const Array<int32_t>& steps, const Inputs& corrections) {
     AdamStep step;
-    step.count = steps.shape(0);
+    step.count = d_logits.shape(0);
     for (size_t k = 0; k < std::size(step.arrays); k++)
-        step.arrays[k] = {values[k].data(), gradients[k].data(), first[k].data(), second[k].data(), out[k].data(), rates.data()[k],
-                          values[k].ndim() > 1 ? values[k].shape(1) : 1};
+        step.arrays[k] = {nullptr, gradients[k].data(), first[k].data(), second[k].data(), nullptr, rates.data()[k],
+                          gradients[k].ndim() > 1 ? gradients[k].shape(1) : 1};
     const float* c = constants.data();
     step.constants = {c[0], c[1], c[2], c[3], c[4]};
     step.d_colors = d_colors.data(), step.d_opacity_logits = d_logits.data();
     step.steps = steps.data(), step.corrections = corrections.data(), step.longest = static_cast<int32_t>(corrections.size());
+    return step;
+}
+
+// Shapes are checked by pipeline.kernels.adam, the only caller. The lists have an array for each kind of parameter.
+static void adam(const std::string& isa, const std::vector<Inputs>& values, const std::vector<Inputs>& gradients,
+                 const std::vector<Floats>& first, const std::vector<Floats>& second, const std::vector<Floats>& out, const Inputs& rates,
+                 const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits, const Array<int32_t>& steps,
+                 const Inputs& corrections, int threads) {
+    AdamStep step = adam_step(gradients, first, second, rates, constants, d_colors, d_logits, steps, corrections);
+    for (size_t k = 0; k < std::size(step.arrays); k++)
+        step.arrays[k].values = values[k].data(), step.arrays[k].out = out[k].data();
     const Kernels* kernels = kernels_named(isa);
     const nb::gil_scoped_release unlocked;
     kernels->adam(step, threads);
+}
+
+// Likewise of some rows, in place. limits: the greatest log-scale, and the largest opacity logit.
+static void adam_rows(const std::string& isa, const Array<const int64_t>& rows, const std::vector<Floats>& values,
+                      const std::vector<Inputs>& gradients, const std::vector<Floats>& first, const std::vector<Floats>& second,
+                      const Inputs& rates, const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits,
+                      const Array<int32_t>& steps, const Inputs& corrections, const Floats& log_scales, const Floats& opacity_logits,
+                      const Inputs& least, const Inputs& limits, int threads) {
+    AdamStep step = adam_step(gradients, first, second, rates, constants, d_colors, d_logits, steps, corrections);
+    for (size_t k = 0; k < std::size(step.arrays); k++) step.arrays[k].values = step.arrays[k].out = values[k].data();
+    const AdamRows some = {rows.data(),     log_scales.data(), opacity_logits.data(), least.data(),
+                           least.size() > 1, limits.data()[0],  limits.data()[1]};
+    const Kernels* kernels = kernels_named(isa);
+    const nb::gil_scoped_release unlocked;
+    kernels->adam_rows(step, some, threads);
 }
 
 // Shapes and ranges are checked by pipeline.kernels.rasterizer, the only caller.
@@ -265,6 +289,7 @@ NB_MODULE(_raster, m) {
         .def("contributions", &Raster::contributions)
         .def("layer_depth", &Raster::layer_depth);
     m.def("adam", &raster::adam);
+    m.def("adam_rows", &raster::adam_rows);
     m.def("empty", &raster::OutputPool::array);
     m.def("fma_rate", &raster::fma_rate);
     m.def("bandwidth", &raster::bandwidth);
