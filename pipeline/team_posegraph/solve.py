@@ -187,11 +187,14 @@ def _result(
     counted = component.trusted.copy()
     counted[~component.trusted] = kept
     first, bytes_before = component.setup
+    trace = component.trace
+    if not trace and len(members) == 1:  # nobody to iterate with: it is where it ends before any round
+        trace = [(first, cost, bytes_before)]
     reached: dict[str, tuple[int, int] | None] = {}
     factors = len(component.graph.relative_poses)
     for name, gap in GAPS.items():
         limit = optimum.cost + gap * _cost_scale(optimum.cost, factors)
-        hit = next((t for t in component.trace if t[1] <= limit), None)
+        hit = next((t for t in trace if t[1] <= limit), None)
         reached[name] = (hit[0] - first, hit[2]) if hit else None
     exchanges = max((a.exchanges for a in members if a.exchanges is not None), default=None)
     return {
@@ -205,9 +208,9 @@ def _result(
         "optimum_converged": optimum.converged,
         "gap": _gap(cost, optimum.cost, factors),
         "distance_rms_m": _distance(T, optimum.poses),
-        "rounds": component.trace[-1][0] - first if component.trace else 0,
+        "rounds": trace[-1][0] - first if trace else 0,
         "rounds_setup": first,
-        "bytes": component.trace[-1][2] if component.trace else bytes_before,
+        "bytes": trace[-1][2] if trace else bytes_before,
         "bytes_setup": bytes_before,
         "exchanges": exchanges,
         "rounds_to": {name: hit and hit[0] for name, hit in reached.items()},

@@ -45,6 +45,16 @@ def test_the_team_reaches_the_optimum(helix_file, solver, robots, loss):
         assert result["bytes_setup"] > 0
 
 
+def test_a_robot_alone_is_at_its_optimum_before_the_first_round(helix_file):
+    """Nobody to wait for: what it solved by itself counts, and nothing is called `not reached`."""
+    config = settings("admm", "gnc")
+    result = solve.solve(helix_file, config, 1)
+    assert abs(result["gap"]) < 1e-8
+    assert result["components"][0]["rounds_to"] == dict.fromkeys(solve.GAPS, 0)
+    assert result["components"][0]["bytes_to"] == dict.fromkeys(solve.GAPS, result["bytes_setup"])
+    assert "not reached" not in format_result(result)
+
+
 def test_both_solvers_end_at_the_same_poses_up_to_the_gauge(helix_file):
     costs = [solve.solve(helix_file, settings(solver), 3)["cost"] for solver in ("admm", "elimination")]
     np.testing.assert_allclose(costs[0], costs[1], rtol=1e-8)
