@@ -83,6 +83,8 @@ class RosCamera:
         if not np.any(D):
             return RosCamera(camera, (), False, frame, len(D) > 0)
         fisheye = model in FISHEYE
+        if fisheye:  # of four numbers, but drivers of RealSense send the five of their structure
+            D = np.concatenate([D[:4], np.trim_zeros(D[4:], "b")])
         lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
         if not fisheye and model not in POLYNOMIAL:
             known = ", ".join((*POLYNOMIAL[1:], *FISHEYE))

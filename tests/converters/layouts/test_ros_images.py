@@ -28,7 +28,8 @@ from tests.fixtures.rvl_images import rvl
             [0.1, 0.2],
             r"distortion \[0.1, 0.2\] of 'plumb_bob', expected 4 or 5 or 8 or 12 or 14 numbers",
         ),
-        ("equidistant", [0.1, 0, 0, 0, 0], "of 'equidistant', expected 4 numbers"),
+        ("equidistant", [0.1, 0, 0, 0, 0.01], "of 'equidistant', expected 4 numbers"),
+        ("equidistant", [0.1, 0, 0], "of 'equidistant', expected 4 numbers"),
         ("plumb_bob", [float("nan"), 0, 0, 0, 0], "of 'plumb_bob', expected"),
         ("Inverse Brown Conrady", [0.1, 0, 0, 0, 0], "distortion model 'Inverse Brown Conrady'"),
     ],
@@ -51,6 +52,16 @@ def test_one_fisheye_model_has_three_names() -> None:
         object.__setattr__(info, "d", np.array([0.05, -0.01, 0.002, 0.0]))
         maps.append(RosCamera.of(info, False, "here").maps())
     assert all(np.array_equal(maps[0], other) for other in maps[1:])
+
+
+def test_drivers_may_send_a_fifth_number_of_a_fisheye_that_is_zero() -> None:
+    cameras = []
+    for D in ([-0.002, 0.037, -0.036, 0.006], [-0.002, 0.037, -0.036, 0.006, 0.0]):
+        info = Ros(2).info(1, "c", COLOR)
+        object.__setattr__(info, "distortion_model", "equidistant")
+        object.__setattr__(info, "d", np.array(D))
+        cameras.append(RosCamera.of(info, False, "here"))
+    assert cameras[0] == cameras[1]
 
 
 def gray_card() -> np.ndarray:
