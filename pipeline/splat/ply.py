@@ -75,15 +75,15 @@ def read_ply(path: str | Path) -> Gaussians:
     table = _read_table(path)
     norms = np.linalg.norm(table[:, 13:17].astype(np.float64), axis=1)
     if not np.isfinite(table).all():
-        raise DuagError(f"{path.name}: has values that are not finite")
+        raise DuagError(f"{path}: has values that are not finite")
     if len(table) and np.abs(norms - 1.0).max() > 1e-3:
-        raise DuagError(f"{path.name}: rot_0..3 has length {norms.min():.3g}..{norms.max():.3g}, expected 1")
+        raise DuagError(f"{path}: rot_0..3 has length {norms.min():.3g}..{norms.max():.3g}, expected 1")
     if len(table) and table[:, 10:13].max() > np.log(1e4):
-        raise DuagError(f"{path.name}: scale_0..2 reach {table[:, 10:13].max():.3g}, expected log of meters")
+        raise DuagError(f"{path}: scale_0..2 reach {table[:, 10:13].max():.3g}, expected log of meters")
     opacity = table[:, 9]
     if len(table) and table[:, 10:13].min() > 0 and opacity.min() >= 0 and opacity.max() <= 1:
         raise DuagError(
-            f"{path.name}: scale_0..2 are {table[:, 10:13].min():.3g} or more and opacity is "
+            f"{path}: scale_0..2 are {table[:, 10:13].min():.3g} or more and opacity is "
             f"{opacity.min():.3g}..{opacity.max():.3g}, expected log of meters and logits: were they activated?"
         )
     return Gaussians(
@@ -102,19 +102,17 @@ def _read_table(path: Path) -> NDArray[np.float32]:
     data = read_bytes(path, "a map")
     end = data.find(b"end_header\n", 0, _HEADER_LIMIT_BYTES)
     if not data.startswith(b"ply\n") or end < 0:
-        raise DuagError(f"{path.name}: not a .ply file")
+        raise DuagError(f"{path}: not a .ply file, expected a map of Gaussians")
     lines = data[:end].decode("ascii", errors="replace").splitlines()[1:]
     lines = [line for line in lines if not line.startswith(("comment", "obj_info"))]
     if len(lines) < 2 or lines[0] != "format binary_little_endian 1.0":
-        raise DuagError(f"{path.name}: format is {lines[:1]}, expected binary_little_endian 1.0")
+        raise DuagError(f"{path}: format is {lines[:1]}, expected binary_little_endian 1.0")
     words = lines[1].split()
     if len(words) != 3 or words[:2] != ["element", "vertex"] or not words[2].isdigit():
-        raise DuagError(f"{path.name}: first element is '{lines[1]}', expected 'element vertex N'")
+        raise DuagError(f"{path}: first element is '{lines[1]}', expected 'element vertex N'")
     if lines[2:] != [f"property float {name}" for name in PROPERTIES]:
-        raise DuagError(
-            f"{path.name}: properties differ from {' '.join(PROPERTIES)}, all float, in this order"
-        )
+        raise DuagError(f"{path}: properties differ from {' '.join(PROPERTIES)}, all float, in this order")
     body, row_bytes = data[end + len(b"end_header\n") :], 4 * len(PROPERTIES)
     if len(body) != int(words[2]) * row_bytes:
-        raise DuagError(f"{path.name}: {len(body)} bytes of vertices, expected {int(words[2]) * row_bytes}")
+        raise DuagError(f"{path}: {len(body)} bytes of vertices, expected {int(words[2]) * row_bytes}")
     return np.frombuffer(body, dtype="<f4").reshape(-1, len(PROPERTIES))

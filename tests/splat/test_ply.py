@@ -87,8 +87,9 @@ def test_files_that_are_no_such_ply(tmp_path: Path, old: bytes, new: bytes, word
     path = tmp_path / "map.ply"
     write_ply(path, some(3))
     path.write_bytes(path.read_bytes().replace(old, new, 1))
-    with pytest.raises(DuagError, match=words):
+    with pytest.raises(DuagError, match=words) as error:
         read_ply(path)
+    assert str(error.value).startswith(f"{path}: ")  # two runs have files of one name
 
 
 def test_activated_values_are_refused(tmp_path: Path) -> None:
