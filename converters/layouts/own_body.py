@@ -24,8 +24,8 @@ Stack = NDArray[np.floating]
 class OwnBody:
     """Finds large pieces at the border whose depth stays as it is while that of most pixels changes.
 
-    A floor keeps its depth too, where the camera moves along it. But it goes on where the body has an edge, with the
-    scene some way behind it.
+    A floor keeps its depth too, where the camera moves along it. But it goes on, as its plane does, where the body has
+    an edge, with the scene some way behind it.
     """
 
     def __init__(self) -> None:
@@ -102,7 +102,10 @@ def percentiles(depth: Stack) -> Stack:
 
 
 def _with_edge(piece: Mask, middle: Stack) -> Mask:
-    """The piece, with what it encloses, if most of what is next to it is farther away; else nothing.
+    """The piece, with what it encloses, if most of what is next to it is farther than it goes on; else nothing.
+
+    The inverse depth of a plane is linear in the image: toward its horizon a floor's depth grows by more than a step,
+    as it did before.
 
     Args:
         piece: bool [h, w].
@@ -116,5 +119,11 @@ def _with_edge(piece: Mask, middle: Stack) -> Mask:
     if not around.any():
         return np.zeros_like(piece)
     rows, columns = ndimage.distance_transform_edt(~piece, return_distances=False, return_indices=True)
-    steps = middle[around] / middle[rows[around], columns[around]]
+    edge = rows[around], columns[around]
+    inside = tuple(2 * e - at for e, at in zip(edge, np.nonzero(around), strict=True))  # as far from the edge
+    seen = np.all([(i >= 0) & (i < n) for i, n in zip(inside, piece.shape, strict=True)], axis=0)
+    inside = tuple(np.where(seen, i, e) for i, e in zip(inside, edge, strict=True))
+    inverse = 1 / middle[edge]
+    slope = np.where(piece[inside], inverse - 1 / middle[inside], 0.0)
+    steps = middle[around] * (inverse + np.minimum(slope, 0.0))
     return ndimage.binary_fill_holes(piece) if np.median(steps) >= STEP else np.zeros_like(piece)

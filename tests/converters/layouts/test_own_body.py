@@ -34,6 +34,12 @@ def floor(k: int) -> NDArray[np.float64]:
     return np.minimum(scene(k), along)
 
 
+def hall(k: int) -> NDArray[np.float64]:
+    """What a camera sees that drives 0.3 m above the floor of a hall: the floor's depth grows toward its horizon."""
+    v = np.arange(HEIGHT)[:, None]
+    return np.minimum(5 * scene(k), 300 * 60 / np.maximum(v - 32, 1))
+
+
 def found(images: list[NDArray[np.float64]], seed: int = 0) -> NDArray[np.bool_] | None:
     body, rng = OwnBody(), np.random.default_rng(seed)
     for image in images:
@@ -52,6 +58,13 @@ def test_the_body_is_found_and_little_else() -> None:
     assert not shows[BODY].any()
     assert not shows[52:56, 30:40].any()
     assert np.count_nonzero(~shows) < 1.5 * np.count_nonzero(BODY)
+
+
+def test_a_body_that_slopes_away_is_found() -> None:
+    sloping = np.where(BODY, 300 + 10 * (HEIGHT - np.arange(HEIGHT)[:, None]), 0)
+    shows = found([np.where(BODY, sloping, scene(k)) for k in range(20)])
+    assert shows is not None
+    assert not shows[BODY].any()
 
 
 def test_of_a_long_log_some_images_are_kept() -> None:
@@ -79,6 +92,7 @@ def test_it_is_found_next_to_the_rim_of_an_undistorted_image() -> None:
     [
         [scene(k) for k in range(20)],
         [floor(k) for k in range(20)],
+        [hall(k) for k in range(20)],
         [with_body(scene(3)) for _ in range(20)],  # a camera that stands still
         [with_body(scene(k)) for k in range(LEAST_IMAGES - 1)],
         [np.where(np.roll(BODY, -20, axis=0), 400, scene(k)) for k in range(20)],  # not at the border
@@ -86,7 +100,7 @@ def test_it_is_found_next_to_the_rim_of_an_undistorted_image() -> None:
         [np.zeros((HEIGHT, WIDTH)) for _ in range(20)],
         [],
     ],
-    ids=["room", "floor", "still", "few", "inside", "arm", "no depth", "no image"],
+    ids=["room", "floor", "hall", "still", "few", "inside", "arm", "no depth", "no image"],
 )
 def test_nothing_else_is_taken_for_it(images: list[NDArray[np.float64]]) -> None:
     assert found(images) is None
