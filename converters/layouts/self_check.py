@@ -35,6 +35,7 @@ class ReprojectionCheck:
         self._residuals: list[NDArray[np.float64]] = []
         self._unmoved: list[NDArray[np.float64]] = []
         self._depths: list[NDArray[np.float64]] = []
+        self._noise: list[NDArray[np.float64]] = []
 
     def needs(self, index: int, T_world_camera: NDArray[np.float64] | None) -> bool:
         """Whether frame `index` is compared with another."""
@@ -67,6 +68,7 @@ class ReprojectionCheck:
         self._depths.append(found[found > 0])
         still = np.abs(second - first)[::STRIDE, ::STRIDE]
         self._unmoved.append(still[((first > 0) & (second > 0))[::STRIDE, ::STRIDE]])
+        self._noise.append(_noise(second[::STRIDE, ::STRIDE]))
 
     def result(self, label: str, max_ratio: float = MAX_RATIO) -> dict[str, Any]:
         """Median residual and median depth in meters, None where too little overlaps; and whether poses are rough.
@@ -76,8 +78,8 @@ class ReprojectionCheck:
             max_ratio: largest residual as a share of the depth; more where the true poses are known to be
                 rough.
         Raises:
-            DuagError: the residual is too large, and not far less than without a motion: poses, depth and intrinsics do
-                not belong together.
+            DuagError: the residual is too large, more than the noise of the depth explains, and not far less than
+                without a motion: poses, depth and intrinsics do not belong together.
         """
         residuals = np.concatenate([*self._residuals, np.zeros(0)])
         if len(residuals) < MIN_PIXELS:
@@ -86,10 +88,36 @@ class ReprojectionCheck:
         found: dict[str, Any] = {"reprojection_median_m": residual, "median_depth_m": depth}
         if residual <= max_ratio * depth:
             return found
-        unmoved = float(np.median(np.concatenate([*self._unmoved, np.zeros(0)])))
-        if residual > ROUGH * unmoved:
+        noise = _median(self._noise)
+        wrong = _without(residual, noise)
+        if wrong <= max_ratio * depth:
+            return found
+        if wrong > ROUGH * _without(_median(self._unmoved), noise):
             raise DuagError(
                 f"{label}: depth moved by the poses differs by {residual:.3f} m at {depth:.2f} m (medians), expected "
                 f"less than {max_ratio:.0%}: poses, intrinsics and depth do not belong together"
             )
         return found | {"rough": True}
+
+
+def _median(parts: list[NDArray[np.float64]]) -> float:
+    values = np.concatenate([*parts, np.zeros(0)])
+    return float(np.median(values)) if len(values) else 0.0
+
+
+def _without(size: float, noise: float) -> float:
+    """What is left of a difference without that of noise alone."""
+    return float(np.sqrt(max(size**2 - noise**2, 0.0)))
+
+
+def _noise(depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sizes of the differences that two measurements of samples have by noise alone, as rows are rougher than planes.
+
+    Inverse depth of a plane is linear in the image: the second difference of three samples is noise, but at edges.
+
+    Args:
+        depth_m: [h, w], 0 = none.
+    """
+    inverse = 1 / np.where(depth_m > 0, depth_m, np.nan)
+    rough = np.abs(inverse[:, 2:] - 2 * inverse[:, 1:-1] + inverse[:, :-2]) * depth_m[:, 1:-1] ** 2
+    return rough[np.isfinite(rough)] * np.sqrt(2 / 6)

@@ -12,13 +12,13 @@ CAMERA = PinholeCamera(80, 60, 70.0, 70.0, 39.5, 29.5)
 FRAMES = 30
 
 
-def checked(scale: float) -> ReprojectionCheck:
+def checked(scale: float, noise_m: float = 0.0) -> ReprojectionCheck:
     """A camera that goes 5 cm a frame toward a wall at 4 m, by poses that say it goes so many times as far."""
-    check = ReprojectionCheck(CAMERA, FRAMES)
+    check, rng = ReprojectionCheck(CAMERA, FRAMES), np.random.default_rng(0)
     for k in range(FRAMES):
         pose = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, scale * 0.05 * k])
         if check.needs(k, pose):
-            check.add(k, np.full((60, 80), 4.0 - 0.05 * k), pose)
+            check.add(k, 4.0 - 0.05 * k + noise_m * rng.standard_normal((60, 80)), pose)
     return check
 
 
@@ -38,3 +38,15 @@ def test_rough_poses_are_reported_and_not_refused() -> None:
 def test_poses_of_another_convention_are_refused(scale: float) -> None:
     with pytest.raises(DuagError, match="do not belong together"):
         checked(scale).result("rec")
+
+
+def test_noise_of_the_depth_is_no_fault_of_the_poses() -> None:
+    rows = checked(1.0, noise_m=0.3).result("rec")
+    assert rows["reprojection_median_m"] > 0.06 * rows["median_depth_m"]
+    assert "rough" not in rows
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.0, 2.0])
+def test_noise_hides_no_other_convention(scale: float) -> None:
+    with pytest.raises(DuagError, match="do not belong together"):
+        checked(scale, noise_m=0.2).result("rec")
