@@ -143,21 +143,24 @@ def calibrate(
     else:
         ranges = [[(t, 0, len(t.ok)) for t in tracked[k::2]] for k in (0, 1)]
         most = max(12, 2 * views // len(tracked))
-    halves = [[load_views(*part, most) for part in half] for half in ranges]
-    cameras = {part.camera for half in halves for part in half}
+    loaded = [[(part, load_views(*part, most)) for part in half] for half in ranges]
+    # a robot whose images show nothing to follow says nothing of the cameras
+    kept = [[(part, seen) for part, seen in half if len(seen.points_map)] for half in loaded]
+    halves = [[seen for _, seen in half] for half in kept]
+    cameras = {seen.camera for half in loaded for _, seen in half}
     if len(cameras) > 1:
         raise DuagError(f"{folder}: its robots have {len(cameras)} different cameras, expected --robot NAME")
-    for half in halves:
+    for half, all_of_it in zip(halves, loaded, strict=True):
         found = sum(len(part.points_map) for part in half)
         if found < MIN_LANDMARKS:
-            names = " and ".join(part.name for part in half)
+            names = " and ".join(seen.name for _, seen in all_of_it)
             raise UndeterminedError(
                 f"{folder}: {found} features were followed in {names}, expected {MIN_LANDMARKS}"
             )
     between = [
         views_between
-        for half, parts in zip(halves, ranges, strict=True)
-        for part, of in zip(half, parts, strict=True)
+        for half in kept
+        for of, part in half
         if (views_between := _between(of, part, most)) is not None
     ]
     return _calibrate(folder, halves, between, source.description)

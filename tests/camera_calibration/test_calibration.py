@@ -5,6 +5,7 @@ import tomllib
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from duagc.converters.datasets import seven_scenes
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.held_out import is_held_out
+from duagc.pipeline.camera_calibration import calibrate as calibration
 from duagc.pipeline.camera_calibration import report
 from duagc.pipeline.camera_calibration.adjustment import (
     Quality,
@@ -120,9 +122,9 @@ def make_views(
         np.array(inverse),
         np.array(normals),
         np.array(samples),
-        np.array(seen_by),
-        np.array(landmarks),
-        np.array(pixels),
+        np.array(seen_by, np.int64),
+        np.array(landmarks, np.int64),
+        np.reshape(pixels, (-1, 2)),
         np.reshape(points, (-1, 3)) + rng.normal(size=(landmarks_count, 3)) * 0.01,
         np.arange(VIEWS),
         late_s,
@@ -195,6 +197,27 @@ def test_known_cameras_are_found(views: Views) -> None:
     held_out = adjust([copy(views)], found.rig, False).quality[0]
     assert held_out.features_px < 0.5 * as_recorded.features_px
     assert held_out.depth < as_recorded.depth
+
+
+def test_a_robot_whose_images_show_nothing_to_follow_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    landmarks = {"alpha": 220, "bravo": 220, "charlie": 0}
+    seen = {robot: make_views(k, landmarks_count=n) for k, (robot, n) in enumerate(landmarks.items())}
+    tracked = [
+        Tracked(Path(), robot, np.zeros((9, 4, 4)), np.ones(9, bool), np.zeros(9, bool), np.arange(9))
+        for robot in seen
+    ]
+
+    def loaded(part: Tracked, first: int, last: int, most: int, *, without: object = ()) -> Views:
+        return copy(seen[part.robot])
+
+    source = SimpleNamespace(robots=list(seen), log=Path, description={})
+    monkeypatch.setattr(calibration, "Recording", lambda folder: source)
+    monkeypatch.setattr(calibration, "_track", lambda logs, config, workers: tracked)
+    monkeypatch.setattr(calibration, "load_views", loaded)
+    found = calibrate(Path("team"), FrontendConfig(), [])
+    assert found.names == ["room 0", "room 1"]
+    assert found.views == 2 * VIEWS
+    assert all(np.isfinite([*judged.before.__dict__.values()]).all() for judged in found.judged)
 
 
 def still_recording(folder: Path, contrast: int = 255) -> Path:
