@@ -13,7 +13,7 @@ from duagc.pipeline.checks import estimate, geometry, gyroscope, images, measure
 from duagc.pipeline.checks.findings import Finding, Report, Severity, judged, lines
 from duagc.pipeline.checks.keyframe_count import KeyframeCount, count_keyframes
 from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
-from duagc.pipeline.config.frontend import KeyframeConfig
+from duagc.pipeline.config.frontend import FailureConfig, KeyframeConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import MotionPrior, Recording, RgbdLog, log_metadata, open_rgbd
@@ -123,7 +123,8 @@ def _check_robot(
     add(stamps.check_pairs(robot, log.pairing, config.times))
     add(geometry.check_camera(robot, log.camera, config.camera))
     shown = np.unique(np.linspace(0, len(log) - 1, config.images.frames).astype(int)).tolist()
-    sight = sights[robot] = images.Sight.of((log.frame(i) for i in shown), log.depth_scale)
+    sight = sights[robot] = images.Sight.of((log.frame(i) for i in shown), log.depth_scale, len(log))
+    add(images.check_light(robot, sight, FailureConfig().max_saturated))
     add(images.check_sight(robot, sight, config.images))
     moved: list[geometry.Move] = []
     if sight.known:

@@ -1,4 +1,4 @@
-"""What the images show: repeated ones, depth that is missing or saturated, colors in the wrong order."""
+"""What the images show: repeated ones, no light, depth that is missing or saturated, colors in the wrong order."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from duagc.pipeline.base.progress import track
 from duagc.pipeline.checks.confidence import share_above
 from duagc.pipeline.checks.findings import Finding, Severity
 from duagc.pipeline.config.checks import ImageChecks
+from duagc.pipeline.frontend.failure import saturated_share_of
+from duagc.pipeline.kernels.pyramid import gray_of_color
 from duagc.pipeline.messages import unpack_stamp
 from duagc.pipeline.recording import Record, RgbdFrame
 from duagc.pipeline.recording.greatest_depth import greatest_apart
@@ -96,7 +98,9 @@ class Sight:
         known_of_frames: [frames], share of the pixels of every frame.
         saturated_of_frames: [frames], share of the known depth of every frame.
         greatest_of_frames: [frames], share of the known depth of every frame that is exactly the greatest.
+        unlit_of_frames: [frames], share of the pixels of every frame whose color is black or white.
         colors_of_frames: [frames, BINS, BINS, BINS], histogram of RGB of every frame, sums to 1.
+        are_all: whether the robot has no other frames.
     """
 
     depth_m: tuple[float, float, float]
@@ -107,20 +111,40 @@ class Sight:
     known_of_frames: NDArray[np.float64]
     saturated_of_frames: NDArray[np.float64]
     greatest_of_frames: NDArray[np.float64]
+    unlit_of_frames: NDArray[np.float64]
     colors_of_frames: NDArray[np.float64]
+    are_all: bool
 
     @property
     def colors(self) -> NDArray[np.float64]:
         """Histogram of RGB of all frames together, [BINS, BINS, BINS], sums to 1."""
         return np.asarray(self.colors_of_frames.mean(axis=0))
 
+    def confidence(self, shown: NDArray[np.bool_], share: float = 0.5) -> float:
+        """Probability that more than a share of the robot's frames shows what some of these do.
+
+        Args:
+            shown: [frames], whether each does.
+            share: of all frames.
+        """
+        if self.are_all:
+            return float(np.count_nonzero(shown) > share * len(shown))
+        return share_above(int(np.count_nonzero(shown)), len(shown), share)
+
     @staticmethod
-    def of(frames: Iterator[RgbdFrame], scale: float) -> Sight:
-        """From the usable pixels of frames, of which every 4th row and column counts. scale: meters per unit."""
-        depths, colors = [], []
+    def of(frames: Iterator[RgbdFrame], scale: float, of_frames: int) -> Sight:
+        """From the usable pixels of frames, of which every 4th row and column counts.
+
+        Args:
+            frames: some of the robot's, or all.
+            scale: meters per unit of depth.
+            of_frames: how many frames the robot has.
+        """
+        depths, colors, unlit = [], [], []
         for frame in frames:
             usable = np.s_[:, :] if frame.mask is None else frame.mask[::4, ::4]
             depths.append(frame.depth[::4, ::4][usable].ravel())
+            unlit.append(saturated_share_of(gray_of_color(frame.color[::4, ::4])[usable]))
             codes = (frame.color[::4, ::4][usable].reshape(-1, 3) // (256 // BINS)).astype(np.int64)
             counts = np.bincount(codes @ [BINS * BINS, BINS, 1], minlength=BINS**3)
             colors.append(counts / max(len(codes), 1))
@@ -141,7 +165,9 @@ class Sight:
             ),
             saturated_of_frames=np.array(saturated[1:]),
             greatest_of_frames=np.array([float((k == greatest_m).sum() / max(len(k), 1)) for k in known]),
+            unlit_of_frames=np.array(unlit),
             colors_of_frames=np.array(colors).reshape(-1, BINS, BINS, BINS),
+            are_all=len(depths) == of_frames,
         )
 
 
@@ -151,7 +177,6 @@ def _percentiles(depth: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def check_sight(robot: str, sight: Sight, config: ImageChecks) -> Iterator[Finding]:
     """Findings about missing and saturated depth."""
-    frames = len(sight.known_of_frames)
     if sight.known == 0:
         yield Finding(
             Severity.ERROR,
@@ -159,7 +184,7 @@ def check_sight(robot: str, sight: Sight, config: ImageChecks) -> Iterator[Findi
             robot,
             "no pixel has depth",
             "some depth in every image",
-            confidence=share_above(frames, frames),
+            confidence=sight.confidence(sight.known_of_frames == 0),
         )
     elif sight.known < config.min_depth:
         yield Finding(
@@ -169,7 +194,7 @@ def check_sight(robot: str, sight: Sight, config: ImageChecks) -> Iterator[Findi
             f"{sight.known:.0%} of the pixels have depth",
             f"more than {config.min_depth:.0%}",
             "tracking and mapping use these alone",
-            confidence=share_above(int((sight.known_of_frames < config.min_depth).sum()), frames),
+            confidence=sight.confidence(sight.known_of_frames < config.min_depth),
         )
     if sight.saturated > config.max_saturated:
         yield Finding(
@@ -179,11 +204,9 @@ def check_sight(robot: str, sight: Sight, config: ImageChecks) -> Iterator[Findi
             f"{sight.saturated:.1%} of the known depth is the largest number, {SATURATED}",
             "0 where nothing was measured",
             TAKE_FOR_NONE,
-            confidence=share_above(
-                int((sight.saturated_of_frames > config.max_saturated).sum()), frames, FEW_FRAMES
-            ),
+            confidence=sight.confidence(sight.saturated_of_frames > config.max_saturated, FEW_FRAMES),
         )
-    elif shown := int((sight.greatest_of_frames > config.max_saturated).sum()):
+    elif (shown := sight.greatest_of_frames > config.max_saturated).any():
         yield Finding(
             Severity.WARNING,
             "depth",
@@ -192,7 +215,28 @@ def check_sight(robot: str, sight: Sight, config: ImageChecks) -> Iterator[Findi
             "beyond all other",
             "0 where nothing was measured",
             TAKE_FOR_NONE,
-            confidence=share_above(shown, frames),
+            confidence=sight.confidence(shown),
+        )
+
+
+def check_light(robot: str, sight: Sight, max_saturated: float) -> Iterator[Finding]:
+    """Findings about color images that show nothing.
+
+    Args:
+        robot: its name.
+        sight: what some of its frames show.
+        max_saturated: share of black and white pixels above which the front end leaves a frame out.
+    """
+    unlit = sight.unlit_of_frames > max_saturated
+    if unlit.any():
+        yield Finding(
+            Severity.ERROR if unlit.all() else Severity.WARNING,
+            "light",
+            robot,
+            f"{np.count_nonzero(unlit)} of {len(unlit)} color images are black or white nearly everywhere",
+            "images that show the scene",
+            "see whether the lens is covered, and the exposure",
+            confidence=sight.confidence(unlit),
         )
 
 

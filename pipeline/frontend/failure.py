@@ -149,7 +149,15 @@ def saturated_share(level: Level) -> float:
     Args:
         level: of a frame.
     """
-    gray = level.gray if level.mask is None else level.gray[level.mask]
+    return saturated_share_of(level.gray if level.mask is None else level.gray[level.mask])
+
+
+def saturated_share_of(gray: NDArray[np.float32]) -> float:
+    """Share of pixels that are as dark or as bright as an image can be; 1 if there is none.
+
+    Args:
+        gray: values 0..1, of any shape.
+    """
     return np.count_nonzero((gray <= 0.01) | (gray >= 0.99)) / gray.size if gray.size else 1.0
 
 

@@ -148,6 +148,21 @@ def gap(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
         yield record, message, publish_ns + late
 
 
+def dark(share: float) -> Change:
+    """Nothing but noise before a part of the color images, as by a covered lens."""
+
+    def change(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+        last_ns = records[0].log_time_ns + share * (records[-1].log_time_ns - records[0].log_time_ns)
+        rng = np.random.default_rng(0)
+        for record, message, publish_ns in nothing(records):
+            if record.topic == COLOR and publish_ns <= last_ns:
+                noise = rng.integers(0, 3, (210, 280, 3), dtype=np.uint8)
+                message.data, message.format = cv2.imencode(".png", noise)[1].tobytes(), "png"
+            yield record, message, publish_ns
+
+    return change
+
+
 def no_depth(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
     for record, message, publish_ns in nothing(records):
         if record.topic == DEPTH:
@@ -177,6 +192,8 @@ FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
     "times twice": (twice, {}, "warning", "times"),
     "times of no clock": (no_clock, {}, "warning", "times"),
     "gap": (gap, {}, "warning", "gaps"),
+    "dark": (dark(1), {}, "error", "light"),
+    "mostly dark": (dark(0.9), {}, "warning", "light"),
     "no depth": (no_depth, {}, "error", "depth"),
     "half the depth": (half_depth, {}, "warning", "pairs"),
 }
