@@ -10,9 +10,30 @@ conversion: it keeps up to 64 MB.
 import ctypes
 import os
 import sys
+from pathlib import Path
 
 _KEPT_BYTES = 64 << 20
 _OWN_MAPPING_BYTES = 32 << 20  # what is larger is given back at once
+_SKX = {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"}  # what OpenCV calls AVX512-SKX
+
+
+def opencv_paths_to_disable(processor: str) -> str:
+    """Value of OPENCV_CPU_DISABLE; OpenCV prints a line about every path that the processor does not have anyway.
+
+    Args:
+        processor: text of /proc/cpuinfo.
+    """
+    lines = (line.partition(":") for line in processor.splitlines())
+    flags = next((set(words.split()) for name, _, words in lines if name.strip() == "flags"), set())
+    return "AVX512-SKX" if flags >= _SKX else ""
+
+
+def _processor() -> str:
+    try:
+        return Path("/proc/cpuinfo").read_text(errors="replace")
+    except OSError:
+        return ""
+
 
 SETTINGS = {
     "OPENBLAS_NUM_THREADS": "1",
@@ -21,7 +42,7 @@ SETTINGS = {
     "OMP_WAIT_POLICY": "passive",  # threads that wait for others leave the processor to who needs it
     "OPENBLAS_CORETYPE": "Haswell",
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
-    "OPENCV_CPU_DISABLE": "AVX512-SKX",
+    "OPENCV_CPU_DISABLE": opencv_paths_to_disable(_processor()),
     "PYTHONHASHSEED": "0",
     "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 26),  # a small file can hold a large image
     "MALLOC_TRIM_THRESHOLD_": str(_KEPT_BYTES),

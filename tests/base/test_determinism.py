@@ -43,3 +43,25 @@ def test_an_error_in_the_child_process_is_the_error_of_the_caller(tmp_path: Path
     assert "DuagError" in called.stderr.splitlines()[-1]
     assert str(tmp_path / "nothing") in called.stderr.splitlines()[-1]
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("processor", "expected"),
+    [
+        ("processor : 0\nflags\t\t: fpu avx2 avx512f avx512dq avx512cd avx512bw avx512vl\n", "AVX512-SKX"),
+        ("processor : 0\nflags\t\t: fpu avx2 avx512f avx512cd\n", ""),
+        ("processor : 0\nflags\t\t: fpu sse4_2 avx2 fma\nbugs : avx512f\n", ""),
+        ("processor : 0\nFeatures : fp asimd\n", ""),
+        ("", ""),
+    ],
+    ids=["server", "part of AVX-512", "AVX2", "ARM", "unknown"],
+)
+def test_opencv_is_asked_to_leave_out_only_what_the_processor_has(processor: str, expected: str) -> None:
+    """On a processor without AVX-512 OpenCV would begin every command with a line on standard error."""
+    assert determinism.opencv_paths_to_disable(processor) == expected
+
+
+def test_opencv_loads_without_a_word() -> None:
+    code = "import duagc, cv2; print(cv2.useOptimized())"
+    result = python("-c", code)
+    assert (result.stdout.strip(), result.stderr) == ("True", "")
