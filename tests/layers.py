@@ -126,7 +126,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         _part(
             "checks",
             "is a recording sound",
-            "base config geometry registration",
+            "base config geometry kernels registration",
             _LOGS,
             "frontend evaluation cache runs",
         ),

@@ -29,7 +29,7 @@ STEPS = {
 def write_bag(path: Path, frames: int) -> None:
     """A few images with noise, which does not compress, again and again."""
     rng, r = np.random.default_rng(0), Ros(1)
-    plain = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    plain = np.full((CAMERA.height, CAMERA.width, 3), 60, np.uint8)
     colors = [cv2.circle(plain.copy(), (50 * k, 200), 40, (90, 200, 50), -1) for k in range(5)]
     jpegs = [cv2.imencode(".jpg", color)[1].tobytes() for color in colors]
     depths = [2000 + rng.integers(0, 500, plain.shape[:2]).astype(np.uint16) for _ in range(5)]
