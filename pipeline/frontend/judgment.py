@@ -47,13 +47,38 @@ class Judgment:
 
     Attributes:
         verdicts: of every pair that was judged.
+        parts: of every keyframe, the part of the path that it is connected with, by its lowest keyframe.
         by_features: the motions that features agree on, of the pairs that they contradict.
         contradicted: the keyframes whose poses were rejected, each with the reason.
     """
 
     verdicts: Mapping[Ends, PairVerdict]
+    parts: Sequence[int]
     by_features: Sequence[RelativePose]
     contradicted: Mapping[int, Reason]
+
+    def corrected(self, pairs: Sequence[RelativePose]) -> list[RelativePose]:
+        """Pairs that may be true, and what features say instead of the others.
+
+        Where features have two parts of the path elsewhere, no registration between the parts counts: those of which
+        features say nothing were made from the same wrong poses, and state that they are exact.
+
+        Args:
+            pairs: registrations and loop closures.
+        """
+        elsewhere = {self._between(pair.i, pair.j) for pair in self.by_features} - {None}
+        kept = [
+            pair
+            for pair in pairs
+            if self._between(pair.i, pair.j) not in elsewhere
+            and not self.verdicts.get((pair.i, pair.j), PairVerdict.OPEN).contradicts
+        ]
+        return [*kept, *self.by_features]
+
+    def _between(self, first: int, second: int) -> Ends | None:
+        """The parts of two keyframes, in order; None: they are in the same one."""
+        low, high = sorted((self.parts[first], self.parts[second]))
+        return None if low == high else (low, high)
 
 
 def judge(
@@ -105,7 +130,7 @@ def judge(
     sizes = {part: parts.count(part) for part in set(parts)}
     main = max(sizes, key=lambda part: (sizes[part], -part))
     contradicted = {k: _reason(k, verdicts) for k, part in enumerate(parts) if part != main}
-    return Judgment(verdicts, by_features, contradicted)
+    return Judgment(verdicts, parts, by_features, contradicted)
 
 
 def _judged(count: int, factors: Sequence[RelativePose], config: JudgmentConfig) -> list[Ends]:

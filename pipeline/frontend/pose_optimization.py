@@ -104,13 +104,13 @@ class PathOptimization:
         judgment = self._judged(path, 1)
         if not judgment.contradicted:
             return path
-        pairs = _corrected(pairs, judgment)
+        pairs = judgment.corrected(pairs)
         solution, factors = self._optimized(keyframes, pairs, 2)
         path = replace(path, solution=solution, factors=factors)
         judgment = self._judged(path, 2)
         if not judgment.contradicted:
             return path
-        path, pairs = _without_rejected(path, _corrected(pairs, judgment), judgment.contradicted)
+        path, pairs = _without_rejected(path, judgment.corrected(pairs), judgment.contradicted)
         solution, factors = self._optimized(path.keyframes, pairs, 3)
         return replace(path, solution=solution, factors=factors)
 
@@ -178,12 +178,6 @@ class PathOptimization:
             checkpoints=self.checkpoints,
             part=f"{part}.bundle",
         )
-
-
-def _corrected(pairs: Sequence[RelativePose], judgment: Judgment) -> list[RelativePose]:
-    """Pairs that nothing contradicts, and what features say of the others."""
-    contradicted = {ends for ends, verdict in judgment.verdicts.items() if verdict.contradicts}
-    return [*(p for p in pairs if (p.i, p.j) not in contradicted), *judgment.by_features]
 
 
 def _without_rejected(

@@ -10,8 +10,10 @@ import pytest
 from duagc.pipeline.experiments.disturbances import Undisturbed
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.judgment import Judgment, PairVerdict, judge
+from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration.features import Features
 from tests.frontend.conftest import CONFIG, STARTS
 
@@ -46,6 +48,37 @@ def test_the_smaller_part_is_contradicted_where_the_path_breaks(tracker: Tracker
     found = judged(tracker, T)
     assert found.contradicted == dict.fromkeys(range(last, len(T)), Reason.CONTRADICTED_BY_FEATURES)
     assert found.verdicts[last, last + 1] is PairVerdict.CONFIRMED
+
+
+def test_no_registration_between_parts_counts_where_features_have_them_elsewhere(tracker: Tracker) -> None:
+    """What features say nothing of was made from the same wrong poses, and says that it is exact."""
+    T = poses(tracker)
+    last = len(T) - 2
+    T[last:] = T[last - 1] @ OFF @ se3.inverse(T[last - 1]) @ T[last:]
+    found = judged(tracker, T)
+
+    def pair(i: int, j: int) -> RelativePose:
+        return RelativePose(i, j, se3.inverse(T[i]) @ T[j], 1e8 * np.eye(6))
+
+    unjudged = pair(0, len(T) - 1)
+    assert (0, len(T) - 1) not in found.verdicts
+    within = [pair(k, k + 1) for k in range(last - 1)]
+    corrected = found.corrected([*within, pair(last - 1, last), unjudged])
+    assert corrected == [*within, *found.by_features]
+    moved = solve_pose_graph(T, [*corrected, pair(last, last + 1)], 1e9).T_map_keyframe
+    for k in range(len(T)):
+        assert max(se3.distance(moved[k], poses(tracker)[k])) < 0.01
+
+
+def test_of_parts_that_only_depth_contradicts_other_registrations_count(tracker: Tracker) -> None:
+    T = poses(tracker)
+    T[-1] = T[-1] @ se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    found = judged(tracker, T, features=False)
+    last = len(T) - 1
+    others = [ends for ends, verdict in found.verdicts.items() if not verdict.contradicts and last in ends]
+    pairs = [RelativePose(i, j, np.eye(4), np.eye(6)) for i, j in [*found.verdicts, (0, last)]]
+    left = [(pair.i, pair.j) for pair in found.corrected(pairs) if pair.j == last]
+    assert left == [*others, (0, last)]
 
 
 def test_one_wrong_keyframe_is_contradicted_alone(tracker: Tracker) -> None:
