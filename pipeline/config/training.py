@@ -25,6 +25,8 @@ class LossConfig(Config):
     """Weight of missing opacity (1 - alpha) where a surface was measured."""
     surface_weight: float = 0.0
     """Weight of one meter between a Gaussian's own depth and the measured one, by its share in the pixel."""
+    depth_sigma_quadratic_per_m: float = Field(default=0.0019, ge=0.0)
+    """Noise of depth of which the log states none, by the square of the distance; 0: none."""
 
 
 class SurfaceLossConfig(LossConfig):
@@ -38,6 +40,8 @@ class SurfaceLossConfig(LossConfig):
     """Weight of missing opacity (1 - alpha) where a surface was measured."""
     surface_weight: float = 0.5
     """Weight of one meter between a Gaussian's own depth and the measured one, by its share in the pixel."""
+    depth_sigma_quadratic_per_m: float = Field(default=0.0, ge=0.0)
+    """Noise of depth of which the log states none, by the square of the distance; 0: none."""
 
 
 class MapLossConfig(Config):

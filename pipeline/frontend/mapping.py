@@ -145,7 +145,7 @@ class Mapper(MapContent):
             view: as of `add_keyframe`.
             more: as of `add_keyframe`.
         """
-        self._views.append(View.of(*view, huber_m=self._loss_weights.depth_huber_m, **more))
+        self._views.append(View.of(*view, loss=self._loss_weights, **more))
 
     def add_border(self, *view: Any, **more: Any) -> None:
         """Take in a keyframe of another tile, which sees some of this one; its pose stays.
@@ -154,7 +154,7 @@ class Mapper(MapContent):
             view: as of `add_keyframe`.
             more: as of `add_keyframe`.
         """
-        self._borders.append(SHELF.put(View.of(*view, huber_m=self._loss_weights.depth_huber_m, **more)))
+        self._borders.append(SHELF.put(View.of(*view, loss=self._loss_weights, **more)))
 
     def add_keyframe(
         self,
@@ -192,7 +192,7 @@ class Mapper(MapContent):
             T_map_camera,
             mask=mask,
             depth_sigma_m=depth_sigma_m,
-            huber_m=self._loss_weights.depth_huber_m,
+            loss=self._loss_weights,
             exposure=exposure,
             information=information,
         )
@@ -248,7 +248,7 @@ class Mapper(MapContent):
             keyframe.T_map_camera @ T_keyframe_camera,
             mask=mask,
             depth_sigma_m=depth_sigma_m,
-            huber_m=self._loss_weights.depth_huber_m,
+            loss=self._loss_weights,
             exposure=exposure,
             information=information,
         )

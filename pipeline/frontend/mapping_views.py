@@ -11,7 +11,7 @@ from duagc.pipeline.geometry import masks, projection, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure, unit_color
 from duagc.pipeline.kernels.training import TrainingView
-from duagc.pipeline.splat.losses import depth_certainty, halve
+from duagc.pipeline.splat.losses import DepthTrust, depth_certainty, halve
 
 Image = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -69,7 +69,7 @@ class View:
         *,
         mask: NDArray[np.bool_] | None,
         depth_sigma_m: Image | None,
-        huber_m: float,
+        loss: DepthTrust,
         exposure: Exposure | None = None,
         information: NDArray[np.float64] | None = None,
     ) -> View:
@@ -82,7 +82,7 @@ class View:
             T_map_camera: [4, 4].
             mask: bool [H, W], pixels that may be used; None = all.
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None = not known pixel by pixel.
-            huber_m: depth sigmas up to it change nothing.
+            loss: how much uncertain depth counts.
             exposure: of the image; None = as the map.
             information: [6, 6] of the pose; None = nothing is known of it.
         """
@@ -90,7 +90,7 @@ class View:
             raise ValueError(f"color is an array of {color.dtype}, expected uint8")
         depth_m = masked_depth(depth_m, mask)
         near = depth_m[::8, ::8]
-        certainty = None if depth_sigma_m is None else depth_certainty(depth_sigma_m, huber_m)
+        certainty = depth_certainty(depth_m, depth_sigma_m, loss)
         return cls(
             index=index,
             color=color,

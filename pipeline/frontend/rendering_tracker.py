@@ -128,7 +128,7 @@ class PoseFit:
             T_map_camera: [4, 4], where to start.
             exposure: where to start.
         """
-        config, sigma_m = self.config, images.depth_sigma_m
+        config = self.config
         drawn = self._rasterizer.forward(
             gaussians, self.camera, se3.inverse(T_map_camera), depth_kind=depth, mask=images.mask
         )
@@ -136,7 +136,7 @@ class PoseFit:
         if np.count_nonzero(opaque) < max(1, config.min_share * opaque.size):
             return None
         color = images.color * np.float32(1 / 255)
-        certainty = None if sigma_m is None else depth_certainty(sigma_m, self._loss.depth_huber_m)
+        certainty = depth_certainty(images.depth_m, images.depth_sigma_m, self._loss)
         T, at = T_map_camera, np.array(exposure)
         best: Fit | None = None
         first, second = np.zeros(PARAMETERS), np.zeros(PARAMETERS)

@@ -106,7 +106,7 @@ class ShutterSearch:
         self._T_map_camera = dict(zip(path.stamps_ns.tolist(), path.poses, strict=True))
         weights = LossWeights(**config.loss.of(depth).model_dump())
         self._step = TrainingStep(Rasterizer(threads=threads), weights, depth)
-        self._huber_m = weights.depth_huber_m
+        self._weights = weights
         self._boards = checkerboards(self._camera.height, self._camera.width)
 
     def run(self, gaussians: Gaussians, compared: Sequence[Frame], trained: Sequence[Frame]) -> float:
@@ -152,7 +152,7 @@ class ShutterSearch:
             image.T_world_camera,
             mask=image.mask,
             depth_sigma_m=image.depth_sigma_m,
-            huber_m=self._huber_m,
+            loss=self._weights,
             exposure=image.exposure,
         )
         return view.training(self._level)

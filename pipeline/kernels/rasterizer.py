@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
 from numbers import Real
 from typing import Any, SupportsIndex
 
@@ -180,9 +179,9 @@ class Rasterizer:
         )
         gain_and_offset = checked_exposure(exposure)
         check_type("loss", loss, LossWeights)
-        *of_images, surface_weight = astuple(loss)
+        of_images = loss.color_huber, loss.depth_weight, loss.depth_huber_m, loss.alpha_weight
         check_share("closing", closing)
-        weights = np.array([*of_images, *gain_and_offset, surface_weight, closing], np.float32)
+        weights = np.array([*of_images, *gain_and_offset, loss.surface_weight, closing], np.float32)
         out = outputs_for(gaussians, parameters)
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
         arguments = [*arrays_of(gaussians), *view, *measured, weights, values, *out, by_pose]

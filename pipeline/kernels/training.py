@@ -18,7 +18,7 @@ from duagc.pipeline.kernels.moving_views import MovingViews
 from duagc.pipeline.kernels.rasterizer import Rasterizer
 from duagc.pipeline.kernels.types import Gradients, LossWeights, ViewLoss
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.losses import depth_certainty
+from duagc.pipeline.splat.losses import DepthTrust, depth_certainty
 
 Image = NDArray[np.float32]
 NO_LIMIT = np.float32(np.inf)
@@ -70,14 +70,14 @@ class TrainingView:
     T_camera_moment: NDArray[np.float64] | None = None
 
     @classmethod
-    def of(cls, view: PosedRgbd, huber_m: float) -> TrainingView:
+    def of(cls, view: PosedRgbd, loss: DepthTrust) -> TrainingView:
         """An image as it was taken, in the colors of the map.
 
         Args:
             view: the image.
-            huber_m: depth sigmas up to it change nothing.
+            loss: how much uncertain depth counts.
         """
-        certainty = None if view.depth_sigma_m is None else depth_certainty(view.depth_sigma_m, huber_m)
+        certainty = depth_certainty(view.depth_m, view.depth_sigma_m, loss)
         return cls(
             view.unit_color, view.depth_m, view.T_world_camera, view.mask, certainty, view.T_camera_moment
         )

@@ -117,6 +117,8 @@ class LossWeights:
         alpha_weight: of missing opacity where a depth was measured.
         surface_weight: of one meter between the depth of single Gaussians, by their blending weight, and the measured
             one.
+        depth_sigma_quadratic_per_m: of depth of which nothing is stated (`splat.losses.depth_certainty`); 0: all of it
+            counts alike.
     """
 
     color_huber: float
@@ -124,6 +126,7 @@ class LossWeights:
     depth_huber_m: float
     alpha_weight: float
     surface_weight: float = 0.0
+    depth_sigma_quadratic_per_m: float = 0.0
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -132,6 +135,7 @@ class LossWeights:
             ("depth_huber_m", SMALLEST_HUBER),
             ("alpha_weight", 0.0),
             ("surface_weight", 0.0),
+            ("depth_sigma_quadratic_per_m", 0.0),
         ):
             value = getattr(self, name)
             if not (isinstance(value, Real) and least <= float(value) <= LARGEST_LOSS_WEIGHT):

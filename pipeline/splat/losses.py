@@ -135,18 +135,34 @@ def rgbd_loss(
     )
 
 
-def depth_certainty(depth_sigma_m: Image, huber_m: float) -> Image:
-    """Factor [H, W] of depth residuals with a standard deviation [H, W] each: min(1, huber_m / sigma), 1 where unknown.
+class DepthTrust(Protocol):
+    """What a loss has to say of uncertain depth; as of `LossConfig`."""
+
+    @property
+    def depth_huber_m(self) -> float: ...
+    @property
+    def depth_sigma_quadratic_per_m(self) -> float: ...
+
+
+def depth_certainty(depth_m: Image, depth_sigma_m: Image | None, loss: DepthTrust) -> Image | None:
+    """Factor [H, W] of the depth residuals: min(1, Huber width / standard deviation); None: 1 everywhere.
 
     Up to the Huber width a residual counts in meters, as without a sigma; a less certain one in units of its sigma,
-    so that it turns linear where that many sigmas are.
+    so that it turns linear where that many sigmas are. Otherwise the depth of far surfaces, whose noise grows with the
+    square of the distance, would outweigh colors, and Gaussians that agree with none of it would become transparent.
 
     Args:
-        depth_sigma_m: [H, W], standard deviation of the depth, meters.
-        huber_m: Huber width of the depth residuals, meters.
+        depth_m: [H, W], meters, 0 = unknown.
+        depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not stated, by the distance.
+        loss: Huber width, and growth of a deviation that is not stated.
     """
-    least = np.maximum(depth_sigma_m, np.float32(huber_m))
-    return np.asarray(np.float32(huber_m) / least, dtype=np.float32)
+    huber_m = np.float32(loss.depth_huber_m)
+    if depth_sigma_m is None:
+        quadratic = np.float32(loss.depth_sigma_quadratic_per_m)
+        if quadratic * depth_m.max(initial=0) ** 2 <= huber_m:
+            return None
+        depth_sigma_m = quadratic * (depth_m * depth_m)
+    return np.asarray(huber_m / np.maximum(depth_sigma_m, huber_m), dtype=np.float32)
 
 
 def halve(image: NDArray) -> NDArray:

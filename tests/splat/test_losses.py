@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.training import LossConfig
+from duagc.pipeline.config.training import LossConfig, SurfaceLossConfig
 from duagc.pipeline.splat.losses import depth_certainty, halve, huber, rgbd_loss
 
 
@@ -18,7 +18,32 @@ class Drawn:
 
 def test_certainty_is_one_up_to_the_huber_width() -> None:
     sigma = np.array([[0.0, 0.01, 0.02, 0.04, 0.2]], np.float32)
-    np.testing.assert_allclose(depth_certainty(sigma, 0.02), [[1, 1, 1, 0.5, 0.1]], rtol=1e-6)
+    found = depth_certainty(np.ones_like(sigma), sigma, LossConfig(depth_huber_m=0.02))
+    assert found is not None
+    np.testing.assert_allclose(found, [[1, 1, 1, 0.5, 0.1]], rtol=1e-6)
+
+
+def test_depth_of_which_nothing_is_stated_is_less_certain_far_away() -> None:
+    loss = LossConfig(depth_huber_m=0.02, depth_sigma_quadratic_per_m=0.002)
+    depth_m = np.array([[0.0, 1.0, 3.0, 10.0, 20.0]], np.float32)
+    found = depth_certainty(depth_m, None, loss)
+    assert found is not None
+    np.testing.assert_allclose(found, [[1, 1, 1, 0.1, 0.025]], rtol=1e-6)
+    assert depth_certainty(depth_m[:, :3], None, loss) is None
+    assert depth_certainty(depth_m, None, SurfaceLossConfig()) is None
+
+
+def test_noise_of_far_depth_does_not_make_surfaces_transparent() -> None:
+    """A surface in 10 m, seen 0.3 m off: without certainty less opacity would lower the loss."""
+    z = np.full((4, 4), 10.0, np.float32)
+    color = np.full((4, 4, 3), 0.5, np.float32)
+    alpha = np.full((4, 4), 0.9, np.float32)
+    drawn = Drawn(color, alpha * (z + np.float32(0.3)), alpha)
+    config = LossConfig()
+    for trust, sign in ((depth_certainty(z, None, config), -1.0), (None, 1.0)):
+        loss = rgbd_loss(drawn, color, z, config, certainty=trust)
+        by_opacity = loss.d_depth * (z + np.float32(0.3)) + loss.d_alpha  # of a Gaussian where the render is
+        assert (np.sign(by_opacity) == sign).all()
 
 
 def views(seed: int = 0, h: int = 5, w: int = 7) -> tuple[Drawn, np.ndarray, np.ndarray]:
