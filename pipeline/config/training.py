@@ -74,8 +74,8 @@ class SparseStepsConfig(Config):
 class LearningRates(Config):
     """Step lengths of Adam: about the change of a parameter per step while its gradient keeps its sign."""
 
-    means: float = 2e-3
-    """Meters."""
+    means: float = 0.06
+    """Share of the Gaussian's size, the geometric mean of its larger two deviations."""
     quats_wxyz: float = 2e-2
     """Of a unit quaternion."""
     log_scales: float = 0.08

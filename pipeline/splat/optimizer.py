@@ -39,6 +39,20 @@ class GaussianGradients(Protocol):
     def opacity_logits(self) -> Floats: ...
 
 
+def sizes(log_scales: Floats) -> Floats:
+    """About the geometric mean [n] of the two larger standard deviations of Gaussians, meters.
+
+    Up to 6 % more: between powers of two the exponential is a straight line, which is the same bits everywhere.
+
+    Args:
+        log_scales: [n, 3], logarithms of the scales in meters.
+    """
+    a, b, c = log_scales.T
+    octaves = (np.maximum(a, b) + np.maximum(np.minimum(a, b), c)) * np.float32(0.5 / np.log(2.0))
+    whole = np.clip(np.floor(octaves), -60, 60)
+    return np.asarray(np.ldexp(1 + (octaves - whole), whole.astype(np.int32)), np.float32)
+
+
 def smoothstep_decay(step: int, steps: int, last: float) -> float:
     """Share of the learning rates at a step: a smoothstep from 1 to `last`.
 
@@ -126,6 +140,8 @@ class Adam:
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
         """The Gaussians after one step; those without any gradient of color or opacity are untouched.
 
+        Centers move by shares of the Gaussians' sizes, so that a scene ten times as large is trained alike.
+
         Source: Kingma and Ba, ICLR 2015, algorithm 1, with beta_2 = 0.99 (few steps per Gaussian).
         """
         touched = (gradients.opacity_logits != 0) | (gradients.colors != 0).any(axis=1)
@@ -133,6 +149,7 @@ class Adam:
         self._steps[rows] = np.minimum(self._steps[rows] + 1, _LONGEST)
         rows = rows[self._corrections[self._steps[rows] - 1] > 0]
         correction = self._corrections[self._steps[rows] - 1]
+        of_size = correction * sizes(gaussians.log_scales[rows])
         values = {name: getattr(gaussians, name).copy() for name in _SHAPES}
         for name, value in values.items():
             g = getattr(gradients, name)[rows]
@@ -140,7 +157,8 @@ class Adam:
             second = BETA_2 * self._second[name][rows] + (1 - BETA_2) * (g * g)
             self._first[name][rows], self._second[name][rows] = first, second
             change = first / (np.sqrt(second) + EPSILON) * np.float32(getattr(rates, name))
-            value[rows] -= change * correction.reshape(-1, *[1] * (g.ndim - 1))
+            factors = of_size if name == "means" else correction
+            value[rows] -= change * factors.reshape(-1, *[1] * (g.ndim - 1))
         return gaussians.replace(**values)
 
 

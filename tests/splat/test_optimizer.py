@@ -10,7 +10,7 @@ from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.kernels import CompiledAdam, Gradients, available_isas
 from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, step_rows
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, Adam, smoothstep_decay
+from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, Adam, sizes, smoothstep_decay
 
 NAMES = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
@@ -40,14 +40,39 @@ def test_steps_are_the_textbooks(adam_of: type[Adam]) -> None:
     v = {name: np.zeros_like(value) for name, value in expected.items()}
     for t in range(1, 6):
         g = gradients(4, t)
+        of_size = {"means": sizes(gaussians.log_scales).astype(np.float64)[:, None]}
         gaussians = adam.step(gaussians, g, rates)
         for name in NAMES:
             m[name] = BETA_1 * m[name] + (1 - BETA_1) * getattr(g, name)
             v[name] = BETA_2 * v[name] + (1 - BETA_2) * getattr(g, name).astype(np.float64) ** 2
             unbiased = m[name] / (1 - BETA_1**t), v[name] / (1 - BETA_2**t)
-            expected[name] = expected[name] - getattr(rates, name) * unbiased[0] / np.sqrt(unbiased[1])
+            step = getattr(rates, name) * of_size.get(name, 1.0)
+            expected[name] = expected[name] - step * unbiased[0] / np.sqrt(unbiased[1])
     for name in NAMES:  # float32 against float64 over five steps of at most 0.05
         np.testing.assert_allclose(getattr(gaussians, name), expected[name], atol=2e-6)
+
+
+def test_sizes_are_means_of_the_two_larger_deviations() -> None:
+    scales = np.exp(np.random.default_rng(3).uniform(-12, 4, (2000, 3)))
+    larger = np.sort(scales, axis=1)[:, 1:]
+    ratio = sizes(np.log(scales).astype(np.float32)) / np.sqrt(larger.prod(axis=1))
+    assert ratio.min() > 0.999
+    assert ratio.max() < 1.063
+
+
+@pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
+def test_a_scene_four_times_as_large_is_trained_alike(adam_of: type[Adam]) -> None:
+    """Scales are powers of two and so is the factor: the moves are the same bits."""
+    gaussians = some(50)
+    powers = np.random.default_rng(5).integers(-6, 2, (50, 3))
+    small = gaussians.replace(
+        log_scales=np.log(2.0**powers).astype(np.float32), means=np.zeros((50, 3), np.float32)
+    )
+    large = small.replace(log_scales=np.log(2.0 ** (powers + 2)).astype(np.float32))
+    g, rates = gradients(50, 1), LearningRates()
+    moved = [adam_of(50).step(g_, g, rates).means for g_ in (small, large)]
+    np.testing.assert_allclose(moved[1], 4 * moved[0], rtol=1e-5)
+    assert (moved[0] != 0).all()
 
 
 @pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])

@@ -24,6 +24,27 @@ inline bool count_steps(const AdamStep& step, const int64_t* rows, size_t begin,
     return any;
 }
 
+// splat.optimizer.sizes of a Gaussian, the same bits.
+inline float size_of(const float* log_scales) {
+    const float a = log_scales[0], b = log_scales[1], c = log_scales[2];
+    const float larger = a > b ? a : b, smaller = a > b ? b : a;
+    const float octaves = (larger + (smaller > c ? smaller : c)) * 0.72134752f;
+    float whole = __builtin_floorf(octaves);
+    whole = whole < -60.0f ? -60.0f : whole > 60.0f ? 60.0f : whole;
+    const uint32_t bits = static_cast<uint32_t>(static_cast<int32_t>(whole) + 127) << 23;
+    float power;
+    __builtin_memcpy(&power, &bits, sizeof power);
+    return (1.0f + (octaves - whole)) * power;
+}
+
+// Corrections of parameters whose rate is a share of the Gaussian's size.
+inline void times_sizes(const AdamStep& step, const int64_t* rows, size_t begin, size_t end, const float* correction, float* of_size) {
+    for (size_t row = begin; row < end; row++) {
+        const size_t at = rows ? static_cast<size_t>(rows[row]) : row;
+        of_size[row - begin] = correction[row - begin] * size_of(step.log_scales + 3 * at);
+    }
+}
+
 // Source: Kingma and Ba, ICLR 2015, algorithm 1. A function of its own, so that the compiler sees arrays that do not overlap
 // and makes vectors of the loop.
 NO_INLINE static void step_elements(size_t count, const AdamConstants& constants, float rate, const float* __restrict correction,
@@ -58,18 +79,20 @@ static void adam(const AdamStep& step, int threads) {
     for (int group = 0; group < groups; group++) {
         const size_t begin = static_cast<size_t>(group) * ADAM_ROWS;
         const size_t end = begin + ADAM_ROWS < step.count ? begin + ADAM_ROWS : step.count;
-        float correction[ADAM_ROWS];
+        float correction[ADAM_ROWS], of_size[ADAM_ROWS];
         const bool any = count_steps(step, nullptr, begin, end, correction);
+        if (any) times_sizes(step, nullptr, begin, end, correction, of_size);
         for (const AdamArray& array : step.arrays) {
+            const float* factors = array.of_size ? of_size : correction;
             if (!any)
                 __builtin_memcpy(array.out + begin * array.width, array.values + begin * array.width,
                                  (end - begin) * array.width * sizeof(float));
             else if (array.width == 1)
-                step_array<1>(array, step.constants, begin, end, correction);
+                step_array<1>(array, step.constants, begin, end, factors);
             else if (array.width == 3)
-                step_array<3>(array, step.constants, begin, end, correction);
+                step_array<3>(array, step.constants, begin, end, factors);
             else
-                step_array<4>(array, step.constants, begin, end, correction);
+                step_array<4>(array, step.constants, begin, end, factors);
         }
     }
 }
@@ -107,16 +130,19 @@ static void adam_rows(const AdamStep& step, const AdamRows& some, int threads) {
     for (int group = 0; group < groups; group++) {
         const size_t begin = static_cast<size_t>(group) * ADAM_ROWS;
         const size_t end = begin + ADAM_ROWS < step.count ? begin + ADAM_ROWS : step.count;
-        float correction[ADAM_ROWS];
-        if (count_steps(step, some.rows, begin, end, correction))
+        float correction[ADAM_ROWS], of_size[ADAM_ROWS];
+        if (count_steps(step, some.rows, begin, end, correction)) {
+            times_sizes(step, some.rows, begin, end, correction, of_size);  // before log-scales change
             for (const AdamArray& array : step.arrays) {
+                const float* factors = array.of_size ? of_size : correction;
                 if (array.width == 1)
-                    step_rows<1>(array, step.constants, some.rows, begin, end, correction);
+                    step_rows<1>(array, step.constants, some.rows, begin, end, factors);
                 else if (array.width == 3)
-                    step_rows<3>(array, step.constants, some.rows, begin, end, correction);
+                    step_rows<3>(array, step.constants, some.rows, begin, end, factors);
                 else
-                    step_rows<4>(array, step.constants, some.rows, begin, end, correction);
+                    step_rows<4>(array, step.constants, some.rows, begin, end, factors);
             }
+        }
         for (size_t row = begin; row < end; row++) {
             const size_t at = static_cast<size_t>(some.rows[row]);
             float &logit = some.opacity_logits[at], *scales = some.log_scales + 3 * at;

@@ -216,6 +216,7 @@ struct AdamArray {
     float* out;             // the values after the step
     float rate;
     size_t width;           // 1, 3 or 4
+    bool of_size;           // the rate is a share of the Gaussian's size
 };
 struct AdamConstants {
     float beta_1, rest_1, beta_2, rest_2, epsilon;  // rest = 1 - beta
@@ -224,6 +225,7 @@ struct AdamStep {
     size_t count;
     AdamArray arrays[5];
     AdamConstants constants;
+    const float* log_scales;                   // of all Gaussians, before the step
     const float *d_colors, *d_opacity_logits;  // zero where the view did not touch a Gaussian
     int32_t* steps;                            // [count], those taken so far, at most `longest`
     const float* corrections;                  // [longest], of the bias after 1, 2, ... steps

@@ -80,6 +80,8 @@ static nb::tuple bandwidth(int threads, double seconds) {
     return nb::make_tuple(read, copied);
 }
 
+constexpr size_t MEANS = 0, LOG_SCALES = 2;  // among the kinds of parameters
+
 static AdamStep adam_step(const std::vector<Inputs>& gradients, const std::vector<Floats>& first, const std::vector<Floats>& second,
                           const Inputs& rates, const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits,
                           const Array<int32_t>& steps, const Inputs& corrections) {
@@ -87,7 +89,7 @@ static AdamStep adam_step(const std::vector<Inputs>& gradients, const std::vecto
     step.count = d_logits.shape(0);
     for (size_t k = 0; k < std::size(step.arrays); k++)
         step.arrays[k] = {nullptr, gradients[k].data(), first[k].data(), second[k].data(), nullptr, rates.data()[k],
-                          gradients[k].ndim() > 1 ? gradients[k].shape(1) : 1};
+                          gradients[k].ndim() > 1 ? gradients[k].shape(1) : 1, k == MEANS};
     const float* c = constants.data();
     step.constants = {c[0], c[1], c[2], c[3], c[4]};
     step.d_colors = d_colors.data(), step.d_opacity_logits = d_logits.data();
@@ -103,6 +105,7 @@ static void adam(const std::string& isa, const std::vector<Inputs>& values, cons
     AdamStep step = adam_step(gradients, first, second, rates, constants, d_colors, d_logits, steps, corrections);
     for (size_t k = 0; k < std::size(step.arrays); k++)
         step.arrays[k].values = values[k].data(), step.arrays[k].out = out[k].data();
+    step.log_scales = values[LOG_SCALES].data();
     const Kernels* kernels = kernels_named(isa);
     const nb::gil_scoped_release unlocked;
     kernels->adam(step, threads);
@@ -116,6 +119,7 @@ static void adam_rows(const std::string& isa, const Array<const int64_t>& rows, 
                       const Inputs& least, const Inputs& limits, int threads) {
     AdamStep step = adam_step(gradients, first, second, rates, constants, d_colors, d_logits, steps, corrections);
     for (size_t k = 0; k < std::size(step.arrays); k++) step.arrays[k].values = step.arrays[k].out = values[k].data();
+    step.log_scales = values[LOG_SCALES].data();
     const AdamRows some = {rows.data(),     log_scales.data(), opacity_logits.data(), least.data(),
                            least.size() > 1, limits.data()[0],  limits.data()[1]};
     const Kernels* kernels = kernels_named(isa);
