@@ -134,7 +134,9 @@ class MappingConfig(Config):
     min_opacity: float = 0.03
     """Gaussians below are pruned."""
     max_scale_m: float = Field(default=0.25, gt=0.0)
-    """Greatest standard deviation of a Gaussian: log-scales stop here."""
+    """Greatest standard deviation of a Gaussian, unless `max_scale_of_depth` allows more."""
+    max_scale_of_depth: float = Field(default=0.06, ge=0.0)
+    """The same as a share of the median depth of the keyframes."""
     sweep_keyframes: int = 6
     """Keyframes, the newest and those that see most of what it sees, in whose images the contributions of the Gaussians
     are measured at every keyframe."""
@@ -157,6 +159,17 @@ class MappingConfig(Config):
             return self.depth
         limit_m = min(self.exact_depth_m, EXACT_DEPTH_OF_DISTANCE * median_depth_m)
         return "ray_plane" if depth_noise_m is not None and depth_noise_m < limit_m else "blended"
+
+    def for_depth(self, median_depth_m: float) -> "MappingConfig":
+        """The settings of a map of what is so far away.
+
+        Args:
+            median_depth_m: of what the keyframes see; infinite: unknown.
+        """
+        if not math.isfinite(median_depth_m):
+            return self
+        largest_m = max(self.max_scale_m, self.max_scale_of_depth * median_depth_m)
+        return self.model_copy(update={"max_scale_m": largest_m})
 
     def final_steps(self, keyframes: float, views: float) -> float:
         """Steps of the final optimization of a tile, without a budget.

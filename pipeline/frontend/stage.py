@@ -110,7 +110,8 @@ def run_frontend(
             )
         keyframes = sum(len(submap.keyframes) for submap in tracked.submaps)
         save.tell("keyframes", keyframes, keyframes)
-        noise_m = depth_noise_m(tracked.frames)
+        noise_m, depth_m = depth_noise_m(tracked.frames), median_depth_m(tracked)
+        of_maps = config.model_copy(update={"mapping": config.mapping.for_depth(depth_m)})
         clock.lap("tracking_s")
         components = save.done(
             "joined", lambda: join_submaps(tracked.submaps, _images(log), config, seed=seed, robot=log.robot)
@@ -120,12 +121,12 @@ def run_frontend(
             stage = _ComponentStage(
                 log=log,
                 name=name,
-                config=config,
+                config=of_maps,
                 seed=seed,
                 threads=threads,
                 progress=progress,
                 noise_m=noise_m,
-                depth=config.mapping.depth_kind(noise_m, median_depth_m(tracked)),
+                depth=config.mapping.depth_kind(noise_m, depth_m),
                 clock=clock,
                 checkpoints=save,
             )

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.mapping import MappingConfig
-from duagc.pipeline.config.training import DepthKind, MapLossConfig, SparseStepsConfig, SurfaceLossConfig
+from duagc.pipeline.config.training import (
+    DepthKind,
+    LossConfig,
+    MapLossConfig,
+    SparseStepsConfig,
+    SurfaceLossConfig,
+)
 from duagc.pipeline.evaluation.image_metrics import depth_error, psnr
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 from duagc.pipeline.frontend.mapping_views import View, view_overlap
@@ -68,6 +74,44 @@ def test_views_that_were_never_mapped_are_drawn_well() -> None:
     assert quality > 28.0
     assert error_m < 0.02
     assert completeness > 0.97
+
+
+@pytest.mark.parametrize("scale", [1 / 8, 8.0])
+def test_a_scene_of_another_size_is_mapped_as_well(scale: float) -> None:
+    """Depth is 2 % off, by a pattern of its own in every image: centimeters in a room, half a meter outdoors."""
+
+    def drawn_well(factor: float) -> tuple[float, float, float]:
+        config = MappingConfig(max_gaussians=4000, iterations=20, final_iterations=15, pose_rate=0.0)
+        config = config.for_depth(2.5 * factor)
+        config = config.model_copy(
+            update={"seeding": config.seeding.model_copy(update={"thickness_m": 1e-3 * min(factor, 1.0)})}
+        )
+        mapper = Mapper(CAMERA, config, seed=5, depth="blended")
+        for k, pose in enumerate(POSES[:3]):
+            color, depth_m = shot(pose)
+            noise = np.random.default_rng(k).normal(size=depth_m.shape)
+            depth_m = (factor * depth_m * (1 + 0.02 * noise)).astype(np.float32)
+            T = pose.copy()
+            T[:3, 3] *= factor
+            mapper.add_keyframe(k, color, depth_m, T)
+        mapper.finalize()
+        between = POSES[1] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[1]) @ POSES[2]))
+        color, depth_m = shot(between)
+        between[:3, 3] *= factor
+        render = Rasterizer().forward(mapper.gaussians, CAMERA, se3.inverse(between))
+        error_m, completeness = depth_error(render, (factor * depth_m).astype(np.float32))
+        return psnr(render.color, color / 255), error_m / factor, completeness
+
+    usual, other = drawn_well(1.0), drawn_well(scale)
+    assert other[0] > usual[0] - 1.5
+    assert other[1] < 1.5 * usual[1]
+    assert other[2] > 0.99
+
+
+def test_the_greatest_scale_grows_with_what_is_far_alone() -> None:
+    config = MappingConfig(max_scale_m=0.25, max_scale_of_depth=0.06)
+    largest_m = [config.for_depth(m).max_scale_m for m in (0.3, 2.0, 10.0, np.inf)]
+    assert largest_m == pytest.approx([0.25, 0.25, 0.6, 0.25])
 
 
 def test_the_same_bits_whatever_the_threads() -> None:
@@ -223,15 +267,13 @@ def test_what_was_seen_elsewhere_is_not_given_up_for_what_is_seen_now() -> None:
     turns = [se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.15 * k, 0.0])) for k in range(7)]
     covered = []
     for sweep in (2, 7):
-        crowded = {"max_gaussians": 100, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
+        crowded = {"max_gaussians": 70, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
         crowded |= {"max_scale_m": 0.2, "sparse": SparseStepsConfig(until=0.0)}
         mapper = Mapper(CAMERA, QUICK.model_copy(update=crowded), seed=0)
         stats = [mapper.add_keyframe(k, *shot(pose), pose) for k, pose in enumerate(turns)]
         assert sum(s.pruned for s in stats) > 50
         covered.append(drawn(mapper, turns[0])[2])
-    assert (
-        covered[0] > covered[1] - 0.1
-    )  # 0.94 and 0.98 measured; far less if what the sweep did not see went first
+    assert covered[0] > covered[1] - 0.1  # 0.85 and 0.88 measured; 0.77 if the sweep looks at one keyframe
 
 
 def test_refinement_spends_what_is_free_where_images_are_drawn_worst() -> None:
@@ -291,7 +333,7 @@ def test_overlap_is_a_share_of_the_first_view() -> None:
     def view(k: int, T: np.ndarray, known: bool = True) -> View:
         color, depth = shot(POSES[k])
         depth = depth if known else np.zeros_like(depth)
-        return View.of(k, color, depth, T, mask=None, depth_sigma_m=None, huber_m=0.01)
+        return View.of(k, color, depth, T, mask=None, depth_sigma_m=None, loss=LossConfig(depth_huber_m=0.01))
 
     first = view(0, POSES[0])
     assert view_overlap(first, first, CAMERA, stride_px=4) == 1.0

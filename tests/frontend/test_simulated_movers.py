@@ -35,4 +35,4 @@ def test_what_moves_is_not_in_the_map(tmp_path: Path) -> None:
     z = centers[ahead][inside, 2]
     near = hidden[v, u] & (np.abs(z - first.depth[v, u]) < 0.1)
     assert len(z) > 200
-    assert near.sum() <= 0.002 * len(z)
+    assert near.sum() <= 0.005 * len(z)  # 20 % without masks
