@@ -60,7 +60,8 @@ class RegistrationConfig(Config):
     """The gain must lie between 1 / max_gain and max_gain; else RESIDUAL (covered lens, other scene)."""
     max_sigma_m: float = 0.03
     """Directions with a larger standard deviation at the median depth are weak: they stay at the guess, or where the
-    prior pulls them, and carry no information. The outcome is ILL_CONDITIONED unless the prior knows better."""
+    prior pulls them, and carry no information. The outcome is ILL_CONDITIONED unless the prior knows better. As limits
+    of distances, it grows with this depth beyond 6 m."""
     max_translation_m: float = 0.3
     """Largest correction of the guess; more is JUMP."""
     max_rotation_rad: float = 0.35
@@ -86,7 +87,8 @@ class GeometricVerificationConfig(Config):
     min_overlap: float = Field(default=0.3, ge=0.0, le=1.0)
     """Overlap that the registration must find."""
     max_disagreement_m: float = Field(default=0.03, gt=0.0)
-    """Largest distance between the registrations in the two directions, where both views' images are at hand."""
+    """Largest distance between the registrations in the two directions, where both views' images are at hand. As the
+    limit below, it grows with the median depth beyond 6 m."""
     max_disagreement_rad: float = Field(default=0.03, gt=0.0)
     """The same for the rotation."""
     max_refinement_m: float = Field(default=0.3, gt=0.0)

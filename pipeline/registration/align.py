@@ -201,7 +201,7 @@ class _Determined:
         information = 0.5 * (information + information.T)
         lever = _lever(system)
         values, vectors = np.linalg.eigh(information * np.outer(lever, lever))
-        known = values * config.max_sigma_m**2 >= 1
+        known = values * _max_sigma_m(system, config) ** 2 >= 1
         strong, projection = vectors[:, known], ALL_DIRECTIONS
         if not known.all():
             projection = (lever[:, None] * strong) @ (strong.T / lever)
@@ -222,6 +222,11 @@ class _Determined:
             projection=P,
             condition=before.condition,
         )
+
+
+def _max_sigma_m(system: System, config: RegistrationConfig) -> float:
+    """Standard deviation at the median depth above which a direction is weak."""
+    return config.max_sigma_m * reach_factor(system.seen.median_depth_m)
 
 
 def _lever(system: System) -> Array:
@@ -254,7 +259,7 @@ def _judge(
         or not 1 / config.max_gain < gain < config.max_gain
     ):
         outcome = Outcome.RESIDUAL
-    elif weakest * config.max_sigma_m**2 < 1 - 1e-9:
+    elif weakest * _max_sigma_m(system, config) ** 2 < 1 - 1e-9:
         outcome = Outcome.ILL_CONDITIONED
     elif (
         moved_m > config.max_translation_m * reach_factor(system.seen.median_depth_m)

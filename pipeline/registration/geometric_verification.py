@@ -16,7 +16,7 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.registration.align import Registration, register
+from duagc.pipeline.registration.align import Registration, reach_factor, register
 from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.matched_points import ransac
 from duagc.pipeline.registration.pyramid import RgbdPyramid
@@ -72,6 +72,12 @@ class VerificationView:
     features: Features
     reference: Reference | None = None
     images: Callable[[], RgbdPyramid] | None = None
+
+    @property
+    def median_depth_m(self) -> float:
+        """Of the samples, of the features without samples; infinite if there are none."""
+        points = self.features.points if self.reference is None else self.reference.levels[-1].points
+        return float(np.median(points[:, 2])) if len(points) else np.inf
 
 
 @dataclass(frozen=True)
@@ -271,10 +277,11 @@ def verify(
     if min(one.overlap for one, _, _ in measured) < config.min_overlap:
         return failed(Failure.LOW_OVERLAP, result)
     apart_m, apart_rad = se3.distance(T, measured[-1][1])
-    if apart_m > config.max_disagreement_m or apart_rad > config.max_disagreement_rad:
+    reach = reach_factor(max(first.median_depth_m, second.median_depth_m))
+    if apart_m > config.max_disagreement_m * reach or apart_rad > config.max_disagreement_rad:
         return failed(Failure.DIRECTIONS_DISAGREE, result)
     moved_m, moved_rad = (float(d) for d in se3.distance(guess, T))
-    far = moved_m > config.max_refinement_m or moved_rad > config.max_refinement_rad
+    far = moved_m > config.max_refinement_m * reach or moved_rad > config.max_refinement_rad
     failure = Failure.FAR_FROM_FEATURES if far else None
     return GeometricVerification(
         failure, found, result, T, information, correction_m=moved_m, correction_rad=moved_rad

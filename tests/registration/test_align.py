@@ -340,3 +340,18 @@ def test_outdoors_the_limit_of_a_motion_grows_with_the_distance(reference, end):
     assert np.linalg.norm(result.T_reference_target[:3, 3]) > 0.5
     assert reach_factor(2.0) == reach_factor(6.0) == reach_factor(np.inf) == 1.0
     assert reach_factor(18.0) == 3.0
+
+
+def test_outdoors_what_is_weak_grows_with_the_distance():
+    """As far away as three times 6 m a direction may be known three times as badly."""
+    far = [RgbdPyramid.build(gray, 8 * depth, CAMERA) for gray, depth in (render(START), render(END))]
+    samples = Reference.from_pyramid(far[0], STRIDES)
+    found = register(samples, far[1], np.eye(4))
+    depth_m = float(np.median(far[1].levels[0].points[..., 2]))
+    lever = np.array([1, 1, 1, *[1 / depth_m] * 3])
+    sigma_m = np.linalg.eigvalsh(found.information * np.outer(lever, lever))[0] ** -0.5
+    factor = reach_factor(depth_m)
+    assert factor > 2
+    for limit_m, expected in ((0.8 * sigma_m, Outcome.OK), (0.5 / factor * sigma_m, Outcome.ILL_CONDITIONED)):
+        config = RegistrationConfig(max_sigma_m=limit_m)
+        assert register(samples, far[1], np.eye(4), config).outcome is expected

@@ -107,6 +107,29 @@ def test_every_failed_test_has_its_name(views: tuple[VerificationView, Verificat
     assert verify(first, second, CONFIG, registration=strict, rng=rng()).failure is Failure.NOT_REGISTERED
 
 
+def test_outdoors_limits_of_distances_grow_with_the_depth() -> None:
+    """The same views eight times as large; features are 0.1 m off in both."""
+
+    def failure(factor: float) -> Failure | None:
+        both = []
+        for T, noise in ((FIRST, 1), (SECOND, 2)):
+            gray, depth = render(T, np.random.default_rng(noise))
+            pyramid = RgbdPyramid.build(gray, (factor * depth).astype(np.float32), CAMERA)
+            v, u = (axis.ravel() for axis in np.mgrid[10:110:20, 10:150:20])
+            points = se3.transform(FIRST, projection.back_project(CAMERA, u, v, render(FIRST)[1][v, u]))
+            features = landmarks(T, points)
+            features = replace(features, points=factor * features.points)
+            both.append(VerificationView(features, Reference.from_pyramid(pyramid), lambda p=pyramid: p))
+        first, second = both
+        moved = second.features.points + np.float32([0.1, 0, 0])
+        second = replace(second, features=replace(second.features, points=moved))
+        config = CONFIG.model_copy(update={"max_refinement_m": 0.06, "inlier_m": 0.2})
+        return verify(first, second, config, registration=REGISTRATION, rng=rng()).failure
+
+    assert failure(1.0) is Failure.FAR_FROM_FEATURES
+    assert failure(8.0) is None
+
+
 def test_images_are_read_only_after_the_features_agree(
     views: tuple[VerificationView, VerificationView],
 ) -> None:
