@@ -82,7 +82,6 @@ class JointTraining:
         weights = LossWeights(**config.loss.of(depth).model_dump())
         self._step = TrainingStep(Rasterizer(threads=threads), weights, depth)
         self._limits = ScaleLimits.of(config)
-        self._loss = weights
         self._refined = config.pose_rate > 0 and depth != "ray_plane"
         self._pose_steps = PoseSteps([view.information for view in views])
         self._T_map_camera = np.array([view.T_map_camera for view in views])
@@ -145,7 +144,7 @@ class JointTraining:
         """One step of what a view may see, and of its pose."""
         T_map_camera = self._T_map_camera[chosen]
         posed = replace(self._views[chosen].read(), T_world_camera=T_map_camera)
-        view = TrainingView.of(posed, self._loss)
+        view = TrainingView.of(posed, self._step.loss)
         rows = cells.seen(view.depth_m, T_map_camera, self._camera)
         moves = self._refined and not self._views[chosen].fixed
         loss, gradients = self._step.gradients(

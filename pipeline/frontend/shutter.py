@@ -106,7 +106,6 @@ class ShutterSearch:
         self._T_map_camera = dict(zip(path.stamps_ns.tolist(), path.poses, strict=True))
         weights = LossWeights(**config.loss.of(depth).model_dump())
         self._step = TrainingStep(Rasterizer(threads=threads), weights, depth)
-        self._weights = weights
         self._boards = checkerboards(self._camera.height, self._camera.width)
 
     def run(self, gaussians: Gaussians, compared: Sequence[Frame], trained: Sequence[Frame]) -> float:
@@ -152,7 +151,7 @@ class ShutterSearch:
             image.T_world_camera,
             mask=image.mask,
             depth_sigma_m=image.depth_sigma_m,
-            loss=self._weights,
+            loss=self._step.loss,
             exposure=image.exposure,
         )
         return view.training(self._level)

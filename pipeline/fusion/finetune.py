@@ -121,7 +121,6 @@ class _Training:
     ) -> None:
         self.gaussians, self._trained, self._camera = gaussians, trained, context.camera
         weights = LossWeights(**context.config.finetune.loss.of(context.depth_kind).model_dump())
-        self._loss = weights
         self._take = TrainingStep(Rasterizer(threads=context.threads), weights, context.depth_kind)
         self._adam = CompiledAdam(len(gaussians), threads=context.threads)
         floor_m = context.matching.thickness_floor_m
@@ -142,7 +141,7 @@ class _Training:
 
     def step(self, view: PosedRgbd, looked_at: LookedAt, rates: LearningRates) -> None:
         """Take a step on a view."""
-        image = looked_at.of(TrainingView.of(view, self._loss))
+        image = looked_at.of(TrainingView.of(view, self._take.loss))
         if self._cells is None:
             self.gaussians = self._stepped(image, looked_at.closing, rates)
             return

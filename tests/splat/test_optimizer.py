@@ -62,7 +62,7 @@ def test_sizes_are_means_of_the_two_larger_deviations() -> None:
 
 @pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
 def test_a_scene_four_times_as_large_is_trained_alike(adam_of: type[Adam]) -> None:
-    """Scales are powers of two and so is the factor: the moves are the same bits."""
+    """Scales are powers of two and so is the factor, so that only the logarithms are rounded."""
     gaussians = some(50)
     powers = np.random.default_rng(5).integers(-6, 2, (50, 3))
     small = gaussians.replace(
