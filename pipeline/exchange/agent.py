@@ -234,7 +234,7 @@ class Agent:
     def _states(self, neighbor: Neighbor) -> list[Message]:
         """The state of this round, with the poses of this round if there are any."""
         direct = {n.index for n in self.radio.joined}
-        alive = {n.index for n in self.radio.in_contact if not n.link.revoked}
+        senders = {n.index for n in self.neighbors.values() if n.may_send_evidence}
         state = state_wire.write_state(
             State(
                 links=self.alignment.links,
@@ -243,7 +243,7 @@ class Agent:
                 converged_hops=self.converged_hops,
                 agreed=self.agreed,
                 done=self.done,
-                sources=self.sharing.knowledge.sources(direct, alive),
+                sources=self.sharing.knowledge.sources(direct, senders),
             ),
             short=not self.sharing.enabled,
         )

@@ -81,12 +81,12 @@ class Knowledge:
             del self.incoming[key]
         return keys
 
-    def sources(self, direct: set[int], living: set[int]) -> NDArray[np.uint8]:
+    def sources(self, direct: set[int], senders: set[int]) -> NDArray[np.uint8]:
         """Where the evidence of each owner comes from: COMPLETE, a neighbor, or NOBODY.
 
         Args:
             direct: neighbors that will send their own evidence themselves.
-            living: neighbors not given up.
+            senders: neighbors from which what began to arrive may still come.
         """
         out = np.full(self.team, state_wire.NOBODY, np.uint8)
         for owner in range(self.team):
@@ -95,7 +95,7 @@ class Knowledge:
             elif owner in direct:
                 out[owner] = owner
             else:
-                providers = sorted({e.provider for e in self.incoming.values() if e.owner == owner} & living)
+                providers = sorted({e.provider for e in self.incoming.values() if e.owner == owner} & senders)
                 if providers:
                     out[owner] = providers[0]
         return out

@@ -113,3 +113,8 @@ class Neighbor:
         """Whether the two robots share a frame, and the neighbor knows it."""
         met = self.loop_closing is not None and self.loop_closing.joined is not None
         return met and not self.lost and not self.link.revoked and self.decided
+
+    @property
+    def may_send_evidence(self) -> bool:
+        """Whether evidence may still come from it: a neighbor that will not be joined stops what it began to send."""
+        return self.joined or not (self.lost or self.link.revoked or self.decided)

@@ -14,10 +14,12 @@ from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.exchange.detected_loop_closures import Verifier
+from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.exchange.verification import Verdict
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.network.packets import Kind, chunk_count, parse
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.runs.robot_data import RobotData, SessionResult
 from tests.fixtures.sampling import sampled
@@ -216,3 +218,22 @@ def test_where_nothing_tells_which_link_is_false_nobody_is_put_anywhere(
     assert len(closures) > 4
     assert {c.verdict for c in closures} == {Verdict.UNDECIDED.value}
     assert all("which link is false is open (alpha-bravo" in c.detail for c in closures)
+
+
+@pytest.mark.parametrize("loss", sampled([0.0, 0.3]))
+def test_evidence_that_a_refused_neighbor_began_to_send_comes_from_another(
+    make_robot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loss: float
+) -> None:
+    """The end that verifies begins to send at its first loop closure; then the pair is not joined after all."""
+    large = {name: make_robot(name, 0.6 * i, 4, gaussians=2000) for i, name in enumerate(NAMES)}
+    falsify(monkeypatch, ("alpha", "charlie"), lambda k: None)
+    results = meet(large, NAMES, tmp_path, link=LinkConfig(budget_bytes=12_000, loss_probability=loss))
+    packets = [parse(p.data) for p in read_session(tmp_path / "exchange.mcap").packets]
+    begun = [p for p in packets if p.kind is Kind.EVIDENCE and {p.sender, p.receiver} == {0, 2}]
+    assert begun, "the test needs evidence that was sent before the pair was decided"
+    assert len({p.offset for p in begun}) < chunk_count(Kind.EVIDENCE, begun[0].total), "all of it was sent"
+    for name, result in results.items():
+        assert result.component == NAMES
+        assert result.converged
+        assert set(result.evidence) == set(NAMES) - {name}
+        assert all(len(e.ids) == 2000 for e in result.evidence.values())
