@@ -35,6 +35,13 @@ def main() -> None:
     arguments = parser.parse_args()
     different = False
     for name in arguments.names or RUNS:
+        needs = RUNS[name].needs
+        if needs is not None and not needs.is_dir():
+            line = f"{name}: {needs} not found, which is not distributed with the project"
+            if arguments.names:
+                sys.exit(line)
+            print(f"{line}; left out", flush=True)
+            continue
         with tempfile.TemporaryDirectory() as folder:
             run = make_run(name, Path(folder))
             if arguments.action == "renew":
