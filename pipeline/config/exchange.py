@@ -33,6 +33,11 @@ class PlacesConfig(Config):
     """Least information about the two robots that a sample must promise, in nats; 0: all that the budget allows."""
     enough_closures: int = Field(default=10, ge=0)
     """Verified loop closures with a neighbor from which on no more are looked for by the overlap of views."""
+    rectified_planes: int = Field(default=3, ge=0)
+    """Directions of surfaces that a camera sees from the side, in each of which a view is rectified for features if all
+    others do not join two robots; 0: none."""
+    rectified_keyframes: int = Field(default=48, ge=1)
+    """Most own keyframes, evenly spread, that take part in this; of the neighbor's, as many as may be requested."""
 
 
 class PeerRegistrationConfig(RegistrationConfig):

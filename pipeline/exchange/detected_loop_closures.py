@@ -5,10 +5,13 @@
     DESCRIPTORS  compact descriptors of all keyframes ->
                                                       <- REQUEST   keyframes to examine closely       } as long as
     SAMPLE       one per requested keyframe           ->                                              } it is worth it
+                                                      <- RECTIFIED_REQUEST  keyframes                 } unless what was
+    RECTIFIED    features of surfaces of each         ->                                              } found joins them
                                                       <- CLOSURES  verdict, shared keyframes
 
 What was verified says where further views should overlap, and the search goes on there: with samples that are here
-already, or with others if they are worth their bytes.
+already, or with others if they are worth their bytes. If that does not join the two robots, pairs of all keyframes, or
+of as many as may be requested, are compared by features of surfaces as if the cameras faced them.
 
 The verifier is the end with the lower digest (and name, should they be equal): the end that verifies decides which of
 two measurements counts, and that must not depend on names. It keeps the loop closures. It has decided when its verdict
@@ -17,20 +20,17 @@ has been acknowledged, the provider when the verdict has arrived.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.recall import Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.exchange import injection, place_recognition
+from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
 from duagc.pipeline.exchange.loop_closing import (
     JoinedPair,
     LoopClosureProtocol,
@@ -39,101 +39,26 @@ from duagc.pipeline.exchange.loop_closing import (
     can_be_sent,
     join,
 )
-from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
+from duagc.pipeline.exchange.rectified_search import RectifiedSearch, digest_of
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
-from duagc.pipeline.exchange.view_overlap import overlaps
 from duagc.pipeline.exchange.wire import loop_closing_wire
-from duagc.pipeline.exchange.wire.loop_closing_wire import DescriptorSet, KeyframeSample, Verdicts
+from duagc.pipeline.exchange.wire.loop_closing_wire import (
+    DescriptorSet,
+    KeyframeSample,
+    RectifiedFeatures,
+    Verdicts,
+)
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.network.packets import Kind, MalformedError
-from duagc.pipeline.posegraph.loop_closures import Group, KeyframePoses, consistent, drift
-from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
-from duagc.pipeline.posegraph.surface_agreement import coarse_depth, surface_agreement
-from duagc.pipeline.registration import Reference, RgbdPyramid
-from duagc.pipeline.registration.features import Descriptors, Features, extract, matches
+from duagc.pipeline.posegraph.loop_closures import Consistency, Group, KeyframePoses, consistent
+from duagc.pipeline.posegraph.relative_poses import LoopClosure
+from duagc.pipeline.registration.features import Descriptors, matches
 from duagc.pipeline.runs.robot_data import RobotData
 
-VERIFIER_KINDS = frozenset({Kind.DESCRIPTORS, Kind.SAMPLE})
+VERIFIER_KINDS = frozenset({Kind.DESCRIPTORS, Kind.SAMPLE, Kind.RECTIFIED})
 """Messages that the verifier receives."""
-PYRAMIDS_KEPT = 12
 NOTHING_SHARED = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
-
-
-class KeyframeDatabase:
-    """A robot's own keyframes as others may request them; computed when first needed."""
-
-    def __init__(self, data: RobotData, config: ExchangeConfig, recall: Recalling = computed) -> None:
-        self.data, self.config, self.recall = data, config, recall
-        self._pyramid = lru_cache(maxsize=PYRAMIDS_KEPT)(self._build_pyramid)
-        self._features: list[Features] | None = None
-        self._coarse_depths: list[NDArray[np.float32]] = []
-        odometry = RelativePoses.of(data.odometry)
-        self.graph = OwnGraph(
-            data.robot,
-            data.T_map_keyframe,
-            RelativePoses.of(data.registrations),
-            drift(odometry, data.keyframes, config.consensus.closures),
-        )
-
-    @property
-    def features(self) -> list[Features]:
-        """All features of every keyframe."""
-        if self._features is None:
-            self._features = []
-            for k in range(self.data.keyframes):
-                features, depth_m = self.recall(f"features {self.data.robot} {k}", partial(self._seen, k))
-                self._features.append(features)
-                self._coarse_depths.append(depth_m)
-        return self._features
-
-    def _seen(self, keyframe: int) -> tuple[Features, NDArray[np.float32]]:
-        """Features of a keyframe, and its depth at low resolution."""
-        color, depth_m, _, mask = self.data.images(keyframe)
-        most = self.config.places.features_per_keyframe
-        return extract(color, depth_m, self.data.camera, most, mask=mask), coarse_depth(depth_m)
-
-    def agreement(self, samples: Sequence[NDArray[np.floating]], T_first_peer: Array) -> float:
-        """How well own depth images agree with a neighbor's samples [m, 3], keyframes at T_first_peer [k, 4, 4]."""
-        assert len(self.features) == len(self._coarse_depths)  # which reads the images
-        return surface_agreement(
-            self._coarse_depths,
-            self.data.camera,
-            samples,
-            T_ownmap_keyframe=self.graph.T_first_keyframe,
-            T_ownmap_peer=T_first_peer,
-        )
-
-    def overlaps(self, closures: Sequence[LoopClosure], peer: KeyframePoses) -> dict[tuple[int, int], float]:
-        """How much of own views a neighbor's keyframes should see, by both, near loop closures with it."""
-        return overlaps(closures, self._coarse_depths, self.data.camera, own=self.graph.from_first, peer=peer)
-
-    def pyramid(self, keyframe: int) -> RgbdPyramid:
-        """Images of a keyframe at several resolutions."""
-        return self._pyramid(keyframe)
-
-    def _build_pyramid(self, keyframe: int) -> RgbdPyramid:
-        images = self.data.images(keyframe)
-        camera, sigma_m = self.data.camera, images.depth_sigma_m
-        return RgbdPyramid.build(
-            images.color, images.depth_m, camera, depth_sigma_m=sigma_m, mask=images.mask
-        )
-
-    @property
-    def digest(self) -> bytes:
-        """Eight bytes that depend on what the robot saw, and on nothing else."""
-        whole = hashlib.sha256(b"".join(f.descriptors.tobytes() for f in self.features))
-        return whole.digest()[: loop_closing_wire.DIGEST_BYTES]
-
-    def descriptors(self) -> DescriptorSet:
-        """What a neighbor gets to recognize places."""
-        most = self.config.places.features_per_place
-        compact = [f.descriptors[:most] for f in self.features]
-        return DescriptorSet(compact, self.graph.T_first_keyframe, self.graph.drift)
-
-    def sample(self, keyframe: int) -> KeyframeSample:
-        """What a neighbor gets to verify loop closures with one keyframe."""
-        reference = Reference.sample(self.pyramid(keyframe), self.config.verification.samples)
-        return KeyframeSample(keyframe, self.features[keyframe], reference)
 
 
 class DetectedLoopClosures:
@@ -180,6 +105,7 @@ class Provider(LoopClosureProtocol):
         super().__init__(database.graph.robot, peer)
         self.database, self.config, self.seed = database, database.config, seed
         self.answered: set[int] = set()
+        self.rectified = False  # rectified features were requested, which happens once
 
     def begin(self, send: Send) -> None:
         send(Kind.DESCRIPTORS, loop_closing_wire.write_descriptors(self.database.descriptors()))
@@ -192,6 +118,11 @@ class Provider(LoopClosureProtocol):
                     raise MalformedError(f"request: keyframe {keyframe} was requested before")
                 self.answered.add(keyframe)
                 send(Kind.SAMPLE, loop_closing_wire.write_sample(self.database.sample(keyframe)))
+        elif kind is Kind.RECTIFIED_REQUEST and not self.rectified:
+            for keyframe in loop_closing_wire.read_indices(payload, limit):
+                self.rectified = True
+                found = RectifiedFeatures(keyframe, self.database.rectified(keyframe))
+                send(Kind.RECTIFIED, loop_closing_wire.write_rectified(found))
         elif kind is Kind.CLOSURES and not self.decided:
             verdicts = loop_closing_wire.read_verdicts(payload, limit)
             self.decided = True
@@ -215,6 +146,7 @@ class Verifier(LoopClosureProtocol):
         self.compact: list[Descriptors] = []
         self.unlike: list[Candidate] = []
         self.samples: dict[int, KeyframeSample] = {}
+        self.rectified: RectifiedSearch | None = None  # begun where all else joins nobody
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         if kind is Kind.DESCRIPTORS and self.peer_keyframes is None:
@@ -226,10 +158,20 @@ class Verifier(LoopClosureProtocol):
             self.samples[sample.keyframe] = sample
             for candidate in self.waiting.pop(sample.keyframe):
                 self._verify(candidate)
-            if not self.waiting:
-                self._request(send)
+            self._go_on(send)
+        elif kind is Kind.RECTIFIED and self.rectified is not None and self.peer_keyframes is not None:
+            self.rectified.take(loop_closing_wire.read_rectified(payload, len(self.peer_keyframes.drift)))
+            self._go_on(send)
         else:
             raise MalformedError(f"{kind.name} is not for the verifier, or came twice")
+
+    def _go_on(self, send: Send) -> None:
+        """With what was requested, once all of it is here."""
+        if self.waiting or (self.rectified is not None and self.rectified.wanted):
+            return
+        if self.rectified is not None and not self.rectified.ended:
+            self._compare_rectified(self.rectified)
+        self._request(send)
 
     def _choose(self, received: DescriptorSet, send: Send) -> None:
         """Score all pairs of keyframes and request the samples of the most promising."""
@@ -256,6 +198,8 @@ class Verifier(LoopClosureProtocol):
             if not chosen:
                 break
             for candidate in chosen:
+                if self.rectified is not None and candidate.ends in self.rectified.tried:
+                    continue
                 if candidate.peer_keyframe in self.samples:
                     self._verify(candidate)
                 else:
@@ -263,13 +207,55 @@ class Verifier(LoopClosureProtocol):
         if self.waiting:
             send(Kind.REQUEST, loop_closing_wire.write_indices(sorted(self.waiting)))
             return
+        if self.rectified is None and self._search_rectified(send):
+            return
         for candidate, reason in self.planner.not_requested():
             self.tried.append(Tried(candidate, Verified(Verdict.NOT_REQUESTED, 0, 0, reason)))
+        tried = {t.candidate.peer_keyframe for t in self.tried}
         for candidate in self.unlike:
-            if candidate.peer_keyframe not in self.samples:
+            if candidate.peer_keyframe not in tried:
                 detail = f"{candidate.score} descriptors match at best, {self.config.places.min_score} needed"
                 self.tried.append(Tried(candidate, Verified(Verdict.UNLIKE, 0, 0, detail)))
         self._decide(send)
+
+    def _search_rectified(self, send: Send) -> bool:
+        """If nothing that was found joins the two robots, request rectified features, and samples; whether it did."""
+        assert self.planner is not None
+        assert self.peer_keyframes is not None
+        c = self.config.places
+        theirs = len(self.peer_keyframes.drift)
+        if not (c.rectified_planes and theirs and self.database.data.keyframes):
+            return False
+        if self._consistency()[1].T_ownmap_peermap is not None:
+            return False
+        others = [k for k in range(theirs) if k not in self.samples]
+        room = max(0, c.max_requested_keyframes - len(self.samples))
+        further = [others[k] for k in evenly_spaced(len(others), min(room, len(others)))]
+        self.rectified = RectifiedSearch({*self.samples, *further})
+        self.waiting = {keyframe: [] for keyframe in further}
+        self.planner.requested |= set(further)
+        if further:
+            send(Kind.REQUEST, loop_closing_wire.write_indices(further))
+        send(Kind.RECTIFIED_REQUEST, loop_closing_wire.write_indices(sorted(self.rectified.wanted)))
+        return True
+
+    def _compare_rectified(self, search: RectifiedSearch) -> None:
+        """Verify all pairs of keyframes, of which rectified features are here, that are no loop closures yet."""
+        assert self.planner is not None
+        search.ended = True
+        known = {t.candidate.ends for t in self.tried if t.result.closure is not None}
+        count = self.database.data.keyframes
+        for own in evenly_spaced(count, min(count, self.config.places.rectified_keyframes)):
+            compare = partial(search.compare, own, self.database, self.samples, known=known, seed=self.seed)
+            found = self.database.recall(
+                f"{self.own} verifies {own}, {self.peer} by rectified features", compare
+            )
+            for peer_keyframe, result in found:
+                candidate = Candidate(own, peer_keyframe, self._score(own, peer_keyframe))
+                search.tried[candidate.ends] = Tried(candidate, result)
+                self.planner.take(candidate, result.closure is not None)
+        before = [t for t in self.tried if t.candidate.ends not in search.tried]
+        self.tried = [*before, *search.tried.values()]
 
     def _found_again(self) -> list[Candidate]:
         """Further candidates near the loop closures that were verified, or near those that nearly were."""
@@ -290,8 +276,7 @@ class Verifier(LoopClosureProtocol):
     def _verify(self, candidate: Candidate) -> None:
         assert self.planner is not None
         sample = self.samples[candidate.peer_keyframe]
-        ends = (self.database.features[candidate.own_keyframe], sample.features)
-        own, peer = (hashlib.sha256(f.descriptors.tobytes()).hexdigest() for f in ends)
+        own, peer = digest_of(self.database.features[candidate.own_keyframe]), digest_of(sample.features)
         rng = random_streams.generator(self.seed, "ransac", own=own, peer=peer)
         result = self.database.recall(
             f"{self.own} verifies {candidate.own_keyframe}, {self.peer} {candidate.peer_keyframe}",
@@ -327,10 +312,7 @@ class Verifier(LoopClosureProtocol):
         assert self.peer_keyframes is not None
         self._inject()
         self.tried.sort(key=lambda t: (t.candidate.peer_keyframe, t.candidate.own_keyframe))
-        closures = [t.result.closure for t in self.tried if t.result.closure is not None]
-        consistency = consistent(
-            closures, self.database.graph.from_first, self.peer_keyframes, self.config.consensus.closures
-        )
+        closures, consistency = self._consistency()
         outcomes = iter(zip(consistency.keep.tolist(), consistency.reasons, strict=True))
         for at, t in enumerate(self.tried):
             if t.result.closure is not None:
@@ -355,7 +337,7 @@ class Verifier(LoopClosureProtocol):
             else:
                 self._refuse("the map of the neighbor would lie beyond what can be sent")
         self.samples.clear()
-        self.compact = []
+        self.compact, self.rectified = [], None
         verdicts = Verdicts(
             candidates=sum(t.result.verdict is not Verdict.UNLIKE for t in self.tried),
             verified=len(closures),
@@ -365,6 +347,14 @@ class Verifier(LoopClosureProtocol):
         )
         self.decided = True
         send(Kind.CLOSURES, loop_closing_wire.write_verdicts(verdicts))
+
+    def _consistency(self) -> tuple[list[LoopClosure], Consistency]:
+        """Loop closures that were verified, and which of them agree."""
+        assert self.peer_keyframes is not None
+        closures = [t.result.closure for t in self.tried if t.result.closure is not None]
+        settings = self.config.consensus.closures
+        own = self.database.graph.from_first
+        return closures, consistent(closures, own, self.peer_keyframes, settings)
 
     def _refuse(self, reason: str) -> None:
         """No loop closure counts."""

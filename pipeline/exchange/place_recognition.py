@@ -131,6 +131,7 @@ class Planner:
 
     def take(self, candidate: Candidate, closure: bool) -> None:
         """What became of a candidate."""
+        self._chosen.add(candidate.ends)
         self._outcomes.append((candidate, float(closure)))
 
     def expect(self, overlaps: Mapping[tuple[int, int], float], score: Callable[[int, int], int]) -> None:

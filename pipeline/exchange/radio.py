@@ -13,7 +13,16 @@ from duagc.pipeline.network.signatures import Identity
 from duagc.pipeline.network.transport import Transport
 
 LOOP_CLOSING_KINDS = frozenset(
-    {Kind.HELLO, Kind.DESCRIPTORS, Kind.SAMPLE, Kind.REQUEST, Kind.CLOSURES, Kind.KEYFRAMES}
+    {
+        Kind.HELLO,
+        Kind.DESCRIPTORS,
+        Kind.SAMPLE,
+        Kind.REQUEST,
+        Kind.CLOSURES,
+        Kind.KEYFRAMES,
+        Kind.RECTIFIED_REQUEST,
+        Kind.RECTIFIED,
+    }
 )
 
 

@@ -72,6 +72,7 @@ def verify(
     *,
     config: VerificationConfig,
     rng: np.random.Generator,
+    rectified: tuple[Features, Features] | None = None,
 ) -> Verified:
     """Verify one candidate.
 
@@ -84,15 +85,17 @@ def verify(
         sample: of the neighbor's keyframe, as it sent it.
         config: limits of all tests.
         rng: the stream of this pair of keyframes.
+        rectified: features of the surfaces of both views, the own ones first, as if the cameras faced them.
 
     Returns:
         The verdict, and the loop closure T_own_peer with its information if the verdict is KEPT.
     """
     if config.method != "features":
         return _verified_by_gicp(candidate, own, own_pyramid, sample, config=config, rng=rng)
+    faced, faced_by_peer = rectified or (None, None)
     found = geometric_verification.verify(
-        VerificationView(own, images=lambda: own_pyramid),
-        VerificationView(sample.features, sample.reference),
+        VerificationView(own, images=lambda: own_pyramid, rectified=faced),
+        VerificationView(sample.features, sample.reference, rectified=faced_by_peer),
         config,
         registration=config.registration,
         rng=rng,

@@ -55,6 +55,8 @@ class Kind(IntEnum):
     HELLO = 16  # digest of what the sender saw, from which the roles of the two ends follow
     TREE = 15  # elimination: fronts and blocks up the tree of robots, steps down
     CURRENT_POSES = 17  # poses of the keyframes of one robot while they are sought
+    RECTIFIED_REQUEST = 18  # keyframes whose rectified features are wanted
+    RECTIFIED = 19  # rectified features of one keyframe
 
 
 FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})

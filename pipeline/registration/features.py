@@ -59,10 +59,18 @@ def extract(
         most: number of features kept.
         mask: bool [h, w], pixels that may be used; None: all.
     """
+    return extract_from_gray(gray_of(color), depth_m, camera, most, mask=mask)
+
+
+def gray_of(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The gray image [h, w] that features are found in.
+
+    Args:
+        color: uint8 RGB [h, w, 3].
+    """
     import cv2
 
-    gray = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-    return extract_from_gray(gray, depth_m, camera, most, mask=mask)
+    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def extract_from_gray(

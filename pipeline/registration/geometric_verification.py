@@ -20,6 +20,7 @@ from duagc.pipeline.registration.align import Registration, reach_factor, regist
 from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.matched_points import ransac
 from duagc.pipeline.registration.pyramid import RgbdPyramid
+from duagc.pipeline.registration.rectified_features import matched_points
 from duagc.pipeline.registration.reference import Reference
 
 INDEPENDENT_FEATURES = 10  # at most as many of the errors of matched points count as independent
@@ -67,11 +68,13 @@ class VerificationView:
         reference: samples that the other view is registered to; None: the other is not registered to this view.
         images: reads the pyramid that is registered to the other view's samples, called only after the features
             have agreed; None: this view is not registered to the other.
+        rectified: features of surfaces as if the camera faced them; they count if both views have them.
     """
 
     features: Features
     reference: Reference | None = None
     images: Callable[[], RgbdPyramid] | None = None
+    rectified: Features | None = None
 
     @property
     def median_depth_m(self) -> float:
@@ -115,14 +118,22 @@ def motion_from_features(
         rng: draws the samples of RANSAC.
     """
     pairs = matches(first.descriptors, second.descriptors, config.ratio)
-    if len(pairs) < config.min_inliers:
-        return FeatureMotion(None, len(pairs), 0, config.min_inliers)
     points_first = first.points[pairs[:, 0]].astype(np.float64)
     points_second = second.points[pairs[:, 1]].astype(np.float64)
+    return _motion_of_points(points_first, points_second, config, rng)
+
+
+def _motion_of_points(
+    points_first: Array, points_second: Array, config: GeometricVerificationConfig, rng: np.random.Generator
+) -> FeatureMotion:
+    """The motion that most matched points [n, 3] agree on."""
+    n = len(points_first)
+    if n < config.min_inliers:
+        return FeatureMotion(None, n, 0, config.min_inliers)
     T, agree = ransac(
         points_first, points_second, inlier_m=config.inlier_m, hypotheses=config.hypotheses, rng=rng
     )
-    return FeatureMotion(T, len(pairs), int(agree.sum()), _inliers_needed(len(pairs), config))
+    return FeatureMotion(T, n, int(agree.sum()), _inliers_needed(n, config))
 
 
 def features_agree(
@@ -249,7 +260,11 @@ def verify(
     Returns:
         The motion with its information, or the first test that failed.
     """
-    found = motion_from_features(first.features, second.features, config, rng)
+    if first.rectified is None or second.rectified is None:
+        found = motion_from_features(first.features, second.features, config, rng)
+    else:
+        ours, theirs = (first.features, first.rectified), (second.features, second.rectified)
+        found = _motion_of_points(*matched_points(ours, theirs, config.ratio), config, rng)
 
     def failed(failure: Failure, result: Registration | None = None) -> GeometricVerification:
         return GeometricVerification(failure, found, result, np.eye(4), np.zeros((6, 6)))

@@ -16,7 +16,7 @@ from duagc.pipeline.config.exchange import (
 )
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.exchange import place_recognition
-from duagc.pipeline.exchange.detected_loop_closures import KeyframeDatabase
+from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.exchange.wire import loop_closing_wire

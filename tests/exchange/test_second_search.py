@@ -9,7 +9,8 @@ import pytest
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.exchange import ExchangeConfig, PlacesConfig
 from duagc.pipeline.exchange import detected_loop_closures
-from duagc.pipeline.exchange.detected_loop_closures import KeyframeDatabase, Provider, Verifier
+from duagc.pipeline.exchange.detected_loop_closures import Provider, Verifier
+from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.exchange.view_overlap import ALONG_PATH, overlaps, shared_view

@@ -264,6 +264,44 @@ def read_sample(data: bytes, limit: int) -> KeyframeSample:
     return KeyframeSample(keyframe, Features(descriptors, points), reference)
 
 
+@dataclass(frozen=True)
+class RectifiedFeatures:
+    """Features of the surfaces that a keyframe sees from the side, as if the camera faced them.
+
+    Attributes:
+        keyframe: its index.
+        features: with 3-D points.
+    """
+
+    keyframe: int
+    features: Features
+
+
+_RECTIFIED = struct.Struct("<IHf")
+
+
+def write_rectified(rectified: RectifiedFeatures) -> bytes:
+    """Bytes of RECTIFIED; points as in SAMPLE."""
+    features = rectified.features
+    scale, points = _shorts(features.points)
+    head = _RECTIFIED.pack(rectified.keyframe, len(features), scale)
+    return b"".join([head, array_bytes(features.descriptors, "uint8"), points])
+
+
+def read_rectified(data: bytes, limit: int) -> RectifiedFeatures:
+    """From RECTIFIED of a keyframe below `limit`."""
+    reader = Reader(data, "rectified")
+    keyframe, n, scale = reader.fields(_RECTIFIED)
+    if keyframe >= limit or not 0 <= scale < 1:
+        raise MalformedError(
+            f"rectified: keyframe {keyframe}, expected one below {limit}, or a scale not below 1"
+        )
+    descriptors = reader.array("uint8", (n, DIMENSIONS))
+    points = reader.array("int16", (n, 3)).astype(np.float32) * np.float32(scale)
+    reader.done()
+    return RectifiedFeatures(keyframe, Features(descriptors, points))
+
+
 def _shorts(points: NDArray[np.float32]) -> tuple[float, bytes]:
     """Step (m) and bytes of points in that step; the step as it will be read back."""
     largest = float(np.abs(points).max(initial=0.0))

@@ -1,0 +1,118 @@
+"""A robot's own keyframes as loop closing needs them: features, pyramids of images, what others may request."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from functools import lru_cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.recall import Recalling, computed
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.exchange.own_graph import OwnGraph
+from duagc.pipeline.exchange.view_overlap import overlaps
+from duagc.pipeline.exchange.wire import loop_closing_wire
+from duagc.pipeline.exchange.wire.loop_closing_wire import DescriptorSet, KeyframeSample
+from duagc.pipeline.posegraph.loop_closures import KeyframePoses, drift
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
+from duagc.pipeline.posegraph.surface_agreement import coarse_depth, surface_agreement
+from duagc.pipeline.registration import Reference, RgbdPyramid
+from duagc.pipeline.registration.features import Features, extract, gray_of
+from duagc.pipeline.registration.rectified_features import extract_rectified
+from duagc.pipeline.runs.robot_data import RobotData
+
+PYRAMIDS_KEPT = 12
+
+
+class KeyframeDatabase:
+    """A robot's own keyframes as others may request them; computed when first needed."""
+
+    def __init__(self, data: RobotData, config: ExchangeConfig, recall: Recalling = computed) -> None:
+        self.data, self.config, self.recall = data, config, recall
+        self._pyramid = lru_cache(maxsize=PYRAMIDS_KEPT)(self._build_pyramid)
+        self._features: list[Features] | None = None
+        self._rectified: dict[int, Features] = {}
+        self._coarse_depths: list[NDArray[np.float32]] = []
+        odometry = RelativePoses.of(data.odometry)
+        self.graph = OwnGraph(
+            data.robot,
+            data.T_map_keyframe,
+            RelativePoses.of(data.registrations),
+            drift(odometry, data.keyframes, config.consensus.closures),
+        )
+
+    @property
+    def features(self) -> list[Features]:
+        """All features of every keyframe."""
+        if self._features is None:
+            self._features = []
+            for k in range(self.data.keyframes):
+                features, depth_m = self.recall(f"features {self.data.robot} {k}", partial(self._seen, k))
+                self._features.append(features)
+                self._coarse_depths.append(depth_m)
+        return self._features
+
+    def _seen(self, keyframe: int) -> tuple[Features, NDArray[np.float32]]:
+        """Features of a keyframe, and its depth at low resolution."""
+        color, depth_m, _, mask = self.data.images(keyframe)
+        most = self.config.places.features_per_keyframe
+        return extract(color, depth_m, self.data.camera, most, mask=mask), coarse_depth(depth_m)
+
+    def rectified(self, keyframe: int) -> Features:
+        """Features of the surfaces that a keyframe sees from the side, as if the camera faced them."""
+        if keyframe not in self._rectified:
+            self._rectified[keyframe] = self.recall(
+                f"rectified features {self.data.robot} {keyframe}", partial(self._faced, keyframe)
+            )
+        return self._rectified[keyframe]
+
+    def _faced(self, keyframe: int) -> Features:
+        c = self.config.places
+        gray = gray_of(self.data.images(keyframe).color)
+        return extract_rectified(gray, self.pyramid(keyframe), c.features_per_keyframe, c.rectified_planes)
+
+    def agreement(self, samples: Sequence[NDArray[np.floating]], T_first_peer: Array) -> float:
+        """How well own depth images agree with a neighbor's samples [m, 3], keyframes at T_first_peer [k, 4, 4]."""
+        assert len(self.features) == len(self._coarse_depths)  # which reads the images
+        return surface_agreement(
+            self._coarse_depths,
+            self.data.camera,
+            samples,
+            T_ownmap_keyframe=self.graph.T_first_keyframe,
+            T_ownmap_peer=T_first_peer,
+        )
+
+    def overlaps(self, closures: Sequence[LoopClosure], peer: KeyframePoses) -> dict[tuple[int, int], float]:
+        """How much of own views a neighbor's keyframes should see, by both, near loop closures with it."""
+        return overlaps(closures, self._coarse_depths, self.data.camera, own=self.graph.from_first, peer=peer)
+
+    def pyramid(self, keyframe: int) -> RgbdPyramid:
+        """Images of a keyframe at several resolutions."""
+        return self._pyramid(keyframe)
+
+    def _build_pyramid(self, keyframe: int) -> RgbdPyramid:
+        images = self.data.images(keyframe)
+        camera, sigma_m = self.data.camera, images.depth_sigma_m
+        return RgbdPyramid.build(
+            images.color, images.depth_m, camera, depth_sigma_m=sigma_m, mask=images.mask
+        )
+
+    @property
+    def digest(self) -> bytes:
+        """Eight bytes that depend on what the robot saw, and on nothing else."""
+        whole = hashlib.sha256(b"".join(f.descriptors.tobytes() for f in self.features))
+        return whole.digest()[: loop_closing_wire.DIGEST_BYTES]
+
+    def descriptors(self) -> DescriptorSet:
+        """What a neighbor gets to recognize places."""
+        most = self.config.places.features_per_place
+        compact = [f.descriptors[:most] for f in self.features]
+        return DescriptorSet(compact, self.graph.T_first_keyframe, self.graph.drift)
+
+    def sample(self, keyframe: int) -> KeyframeSample:
+        """What a neighbor gets to verify loop closures with one keyframe."""
+        reference = Reference.sample(self.pyramid(keyframe), self.config.verification.samples)
+        return KeyframeSample(keyframe, self.features[keyframe], reference)

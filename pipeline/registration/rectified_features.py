@@ -1,0 +1,239 @@
+"""Features of surfaces as if the camera faced them: they match where two views look at a surface from the side.
+
+SIFT follows turns about the line of sight, sizes, and tilts of some 30 degrees. Depth says how a surface lies: where
+many pixels share a normal, the image is turned until the camera looks along that normal, which makes of the surface
+what a camera in front of it would see but for its size, and features are found there (as Koeser and Koch 2007, and Wu
+et al. 2008, did with patches).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.geometry import masks
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import back_project
+from duagc.pipeline.registration.features import (
+    DIMENSIONS,
+    Descriptors,
+    Features,
+    brightened,
+    matches,
+    root_sift,
+)
+from duagc.pipeline.registration.pyramid import RgbdPyramid
+
+COARSE_LEVEL = 2  # of the pyramid, whose normals count
+SAME_NORMAL = np.cos(np.radians(20))
+FACED = np.cos(np.radians(25))  # surfaces that the camera sees less from the side are left as they are
+FARTHEST = np.tan(np.radians(80))  # from the middle of a turned image
+LEAST_SHARE = 0.04  # of the coarse pixels that share a normal
+TRIED = 400  # normals, evenly spread, of which the one that most others share is taken
+ROUNDS = 3  # of taking the mean of those that share it
+OUTSIDE = 2  # percent of the pixels on either side that a turned image does without
+MOST_PX = 400_000  # of a turned image
+STEPS = 32  # of a pixel, by which images are interpolated
+SAME_POINT = 0.02
+"""Matches whose points are nearer to each other than this, at one meter, in both views, count once."""
+
+
+@dataclass(frozen=True)
+class _Facing:
+    """Coarse pixels that share a normal.
+
+    Attributes:
+        normal: [3], unit vector towards the camera.
+        members: bool [h, w], of the coarse image.
+    """
+
+    normal: Array
+    members: NDArray[np.bool_]
+
+
+def extract_rectified(gray: NDArray[np.uint8], pyramid: RgbdPyramid, most: int, planes: int) -> Features:
+    """The strongest features of the surfaces of a view that it sees from the side, as if the camera faced them.
+
+    Args:
+        gray: uint8 [h, w], of the whole image.
+        pyramid: of the view.
+        most: number of features kept.
+        planes: most directions that the camera is turned to.
+    """
+    fine = pyramid.levels[0]
+    found = [_features_of(gray, pyramid, facing, most) for facing in _facings(pyramid, planes)]
+    descriptors, pixels, response = (
+        np.concatenate(parts)
+        for parts in zip(
+            *found, (np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 2)), np.zeros(0)), strict=True
+        )
+    )
+    order = np.lexsort((pixels[:, 0], pixels[:, 1], -response))[:most]
+    u, v = pixels[order].T
+    depth_m = 1 / fine.inverse_depth[_nearest(v), _nearest(u)].astype(np.float64)
+    points = back_project(fine.camera, u, v, depth_m)
+    return Features(descriptors[order], points.astype(np.float32))
+
+
+def _facings(pyramid: RgbdPyramid, most: int) -> list[_Facing]:
+    """Normals that many pixels share, the most common first, but for surfaces that the camera faces anyway."""
+    coarse = pyramid.levels[min(COARSE_LEVEL, len(pyramid.levels) - 1)]
+    normals = coarse.normals.astype(np.float64)
+    rays = coarse.camera.rays()
+    rays /= np.sqrt(_dot(rays, rays))[..., None]
+    left = _dot(normals, normals) > 0.5
+    least, out = LEAST_SHARE * left.size, list[_Facing]()
+    while len(out) < most and left.sum() > least:
+        among = normals[left]
+        tried = among[:: -(-len(among) // TRIED)]
+        votes = [int((_dot(among, one) > SAME_NORMAL).sum()) for one in tried]
+        normal = tried[int(np.argmax(votes))]
+        for _ in range(ROUNDS):
+            normal = among[_dot(among, normal) > SAME_NORMAL].sum(axis=0)
+            normal /= np.sqrt(_dot(normal, normal))
+        members = left & (_dot(normals, normal) > SAME_NORMAL)
+        if members.sum() < least:
+            break
+        left &= ~members
+        if np.median(-_dot(rays[members], normal)) < FACED:
+            out.append(_Facing(normal, members))
+    return out
+
+
+def _features_of(
+    gray: NDArray[np.uint8], pyramid: RgbdPyramid, facing: _Facing, most: int
+) -> tuple[Descriptors, Array, Array]:
+    """Descriptors [n, 128] found where the camera faces a surface, pixels (u, v) [n, 2] of the image, and responses."""
+    import cv2
+
+    fine = pyramid.levels[0]
+    none = np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 2)), np.zeros(0)
+    view = _TurnedView.of(facing, pyramid)
+    if view is None:
+        return none
+    keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(view.image(brightened(gray)), None)
+    if not keypoints:
+        return none
+    u, v = view.pixels(np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2))
+    inside = (u >= 1) & (v >= 1) & (u <= fine.camera.width - 2) & (v <= fine.camera.height - 2)
+    row, column = (_nearest(np.where(inside, at, 0)) for at in (v, u))
+    halvings = fine.camera.height // facing.members.shape[0]
+    coarse = tuple(
+        np.minimum(at // halvings, size - 1)
+        for at, size in zip((row, column), facing.members.shape, strict=True)
+    )
+    good = inside & facing.members[coarse] & (fine.inverse_depth[row, column] > 0)
+    if fine.mask is not None:
+        good &= masks.distance_px(fine.mask)[row, column] > [k.size for k in keypoints]
+    response = np.array([k.response for k in keypoints])
+    angle = np.array([k.angle for k in keypoints])
+    order = np.lexsort((angle, u, v, -response))
+    order = order[good[order]][:most]
+    return root_sift(sift[order]), np.stack([u[order], v[order]], axis=1), response[order]
+
+
+@dataclass(frozen=True)
+class _TurnedView:
+    """A camera at the same place that looks along a normal.
+
+    Attributes:
+        camera: of the image that it is turned from.
+        R_turned_camera: [3, 3].
+        focal_px: of the turned camera.
+        corner_px: [2], where its image begins, from the middle.
+        size_px: width and height.
+    """
+
+    camera: PinholeCamera
+    R_turned_camera: Array
+    focal_px: float
+    corner_px: Array
+    size_px: tuple[int, int]
+
+    @staticmethod
+    def of(facing: _Facing, pyramid: RgbdPyramid) -> _TurnedView | None:
+        """The one that shows the surface as large as it is; None if it is seen too much from the side."""
+        coarse = pyramid.levels[min(COARSE_LEVEL, len(pyramid.levels) - 1)].camera
+        camera = pyramid.levels[0].camera
+        z = -facing.normal
+        level = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
+        x = level - _dot(level, z) * z
+        x /= np.sqrt(_dot(x, x))
+        R = np.stack([x, np.cross(z, x), z])
+        rays = coarse.rays()[facing.members]
+        turned = np.stack([_dot(rays, axis) for axis in R], axis=-1)
+        seen = turned[:, 2] > 0
+        uv = turned[seen, :2] / turned[seen, 2:]
+        uv = uv[np.sqrt(_dot(uv, uv)) < FARTHEST]
+        if len(uv) < 0.5 * len(rays):
+            return None
+        first, last = np.percentile(uv, [OUTSIDE, 100 - OUTSIDE], axis=0)
+        extent = np.maximum(last - first, 1e-6)
+        focal_px = min(camera.fx, float(np.sqrt(MOST_PX / (extent[0] * extent[1]))))
+        width, height = (int(size) + 1 for size in extent * focal_px)
+        return _TurnedView(camera, R, focal_px, first * focal_px, (width, height))
+
+    def pixels(self, points: Array) -> tuple[Array, Array]:
+        """Where pixels (u, v) [..., 2] of the turned image are in the other one; (-1, -1): behind it."""
+        uv = (points + self.corner_px) / self.focal_px
+        R = self.R_turned_camera
+        x, y, z = (uv[..., 0] * R[0, k] + uv[..., 1] * R[1, k] + R[2, k] for k in range(3))
+        front = z > 1e-6
+        z = np.where(front, z, 1.0)
+        c = self.camera
+        u, v = c.fx * (x / z) + c.cx, c.fy * (y / z) + c.cy
+        return np.where(front, u, -1.0), np.where(front, v, -1.0)
+
+    def image(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """What it sees, [height, width], by whole numbers, so that it is the same on every processor."""
+        import cv2
+
+        width, height = self.size_px
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+        u, v = self.pixels(grid)
+        steps = [np.clip(np.rint(at * STEPS), -STEPS, 2**14 * STEPS).astype(np.int32) for at in (u, v)]
+        whole = np.stack([at // STEPS for at in steps], axis=-1).astype(np.int16)
+        rest = (steps[1] % STEPS * STEPS + steps[0] % STEPS).astype(np.uint16)
+        return np.asarray(cv2.remap(gray, whole, rest, cv2.INTER_LINEAR), dtype=np.uint8)
+
+
+def matched_points(
+    first: tuple[Features, Features], second: tuple[Features, Features], ratio: float
+) -> tuple[Array, Array]:
+    """Points [n, 3] of matched features of two views, each in its own frame; every pair of points once.
+
+    Features are matched kind by kind, since both kinds of one point would stand in the way of the ratio test.
+
+    Args:
+        first: features of the first view, as it is and rectified.
+        second: the same of the second view.
+        ratio: of the ratio test.
+    """
+    points = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for ours in first:
+        for theirs in second:
+            pairs = matches(ours.descriptors, theirs.descriptors, ratio)
+            points[0].append(ours.points[pairs[:, 0]].astype(np.float64))
+            points[1].append(theirs.points[pairs[:, 1]].astype(np.float64))
+    a, b = (np.concatenate(parts) for parts in points)
+    again = np.tril(_at_one_place(a) & _at_one_place(b), -1).any(axis=1)
+    return a[~again], b[~again]
+
+
+def _at_one_place(points: Array) -> NDArray[np.bool_]:
+    """Whether points [n, 3] are one, [n, n]."""
+    apart = points[:, None] - points[None]
+    limit_m = SAME_POINT * np.maximum(1.0, points[:, 2])
+    return np.asarray(np.sqrt(_dot(apart, apart)) < limit_m[:, None])
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Products of vectors [..., k], term by term: the same on every processor."""
+    return np.asarray(sum(a[..., k] * b[..., k] for k in range(a.shape[-1])))
+
+
+def _nearest(at: Array) -> NDArray[np.int64]:
+    return np.rint(at).astype(np.int64)
