@@ -40,7 +40,7 @@ from duagc.pipeline.exchange.loop_closing import (
     join,
 )
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
-from duagc.pipeline.exchange.rectified_search import RectifiedSearch, digest_of
+from duagc.pipeline.exchange.rectified_search import RectifiedSearch, digest_of, most_alike
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import (
@@ -240,20 +240,24 @@ class Verifier(LoopClosureProtocol):
         return True
 
     def _compare_rectified(self, search: RectifiedSearch) -> None:
-        """Verify all pairs of keyframes, of which rectified features are here, that are no loop closures yet."""
+        """Verify the pairs of keyframes with most features in common that are no loop closures yet."""
         assert self.planner is not None
         search.ended = True
+        database, c, between = self.database, self.config.places, f"{self.own} and {self.peer}, rectified"
+        inliers: dict[tuple[int, int], int] = {}
+        count = database.data.keyframes
+        for own in evenly_spaced(count, min(count, c.rectified_keyframes)):
+            compare = partial(search.compare, own, database, self.samples, self.seed)
+            found = database.recall(f"{between}: {own}", compare)
+            inliers |= {(own, peer_keyframe): agree for peer_keyframe, agree in found}
         known = {t.candidate.ends for t in self.tried if t.result.closure is not None}
-        count = self.database.data.keyframes
-        for own in evenly_spaced(count, min(count, self.config.places.rectified_keyframes)):
-            compare = partial(search.compare, own, self.database, self.samples, known=known, seed=self.seed)
-            found = self.database.recall(
-                f"{self.own} verifies {own}, {self.peer} by rectified features", compare
-            )
-            for peer_keyframe, result in found:
-                candidate = Candidate(own, peer_keyframe, self._score(own, peer_keyframe))
-                search.tried[candidate.ends] = Tried(candidate, result)
-                self.planner.take(candidate, result.closure is not None)
+        for own, peer_keyframe in most_alike(inliers, known, c.candidates_per_keyframe):
+            candidate = Candidate(own, peer_keyframe, self._score(own, peer_keyframe))
+            sample = self.samples[peer_keyframe]
+            check = partial(search.verify, candidate, database, sample, self.seed)
+            result = database.recall(f"{between}: {own} {peer_keyframe}", check)
+            search.tried[candidate.ends] = Tried(candidate, result)
+            self.planner.take(candidate, result.closure is not None)
         before = [t for t in self.tried if t.candidate.ends not in search.tried]
         self.tried = [*before, *search.tried.values()]
 
@@ -352,8 +356,9 @@ class Verifier(LoopClosureProtocol):
         """Loop closures that were verified, and which of them agree."""
         assert self.peer_keyframes is not None
         closures = [t.result.closure for t in self.tried if t.result.closure is not None]
-        settings = self.config.consensus.closures
-        own = self.database.graph.from_first
+        own, settings = self.database.graph.from_first, self.config.consensus.closures
+        if self.rectified is not None:  # weaker evidence of more pairs: one more must agree
+            settings = settings.model_copy(update={"min_support": settings.min_support + 1})
         return closures, consistent(closures, own, self.peer_keyframes, settings)
 
     def _refuse(self, reason: str) -> None:

@@ -6,14 +6,17 @@ import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
 from duagc.pipeline.exchange.loop_closing import Tried
 from duagc.pipeline.exchange.place_recognition import Candidate
-from duagc.pipeline.exchange.verification import Verdict, Verified, verify
+from duagc.pipeline.exchange.verification import Verified, verify
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample, RectifiedFeatures
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.registration.features import Features
+from duagc.pipeline.registration.geometric_verification import motion_from_rectified
 
 
 @dataclass
@@ -23,7 +26,7 @@ class RectifiedSearch:
     Attributes:
         wanted: keyframes of the neighbor whose rectified features are not here yet.
         features: those that arrived, by keyframe.
-        tried: pairs of keyframes whose features agree on a motion, by own keyframe and the neighbor's.
+        tried: pairs of keyframes that were verified, by own keyframe and the neighbor's.
         ended: all pairs were compared.
     """
 
@@ -44,43 +47,72 @@ class RectifiedSearch:
         self.features[found.keyframe] = found.features
 
     def compare(
-        self,
-        own: int,
-        database: KeyframeDatabase,
-        samples: Mapping[int, KeyframeSample],
-        *,
-        known: Collection[tuple[int, int]],
-        seed: int,
-    ) -> list[tuple[int, Verified]]:
-        """Verify an own keyframe with every one of the neighbor.
+        self, own: int, database: KeyframeDatabase, samples: Mapping[int, KeyframeSample], seed: int
+    ) -> list[tuple[int, int]]:
+        """Look for keyframes of the neighbor whose features agree with those of an own one on a motion.
 
         Args:
             own: the keyframe.
             database: own keyframes.
             samples: of the neighbor's, by keyframe.
-            known: pairs that are loop closures already.
             seed: of this run.
         Returns:
-            Keyframes of the neighbor whose features agree with the own ones on a motion, and what became of them.
+            The neighbor's keyframes and the numbers of features that agree.
         """
-        found = list[tuple[int, Verified]]()
-        plain, rectified = database.features[own], database.rectified(own)
-        for keyframe, theirs in sorted(self.features.items()):
-            if (own, keyframe) in known:
-                continue
-            ends = {"own": digest_of(plain, rectified), "peer": digest_of(samples[keyframe].features, theirs)}
-            result = verify(
-                Candidate(own, keyframe, 0),
-                plain,
-                database.pyramid(own),
-                samples[keyframe],
-                config=database.config.verification,
-                rng=random_streams.generator(seed, "ransac.rectified", **ends),
-                rectified=(rectified, theirs),
-            )
-            if result.verdict not in (Verdict.FEW_MATCHES, Verdict.FEW_INLIERS):
-                found.append((keyframe, result))
+        ours, config = (database.features[own], database.rectified(own)), database.config.verification
+        found = list[tuple[int, int]]()
+        for keyframe, rectified in sorted(self.features.items()):
+            theirs = samples[keyframe].features, rectified
+            motion = motion_from_rectified(ours, theirs, config, _stream(seed, ours, theirs))
+            if motion.accepted:
+                found.append((keyframe, motion.inliers))
         return found
+
+    def verify(
+        self, candidate: Candidate, database: KeyframeDatabase, sample: KeyframeSample, seed: int
+    ) -> Verified:
+        """Verify a pair of keyframes by features of both kinds.
+
+        Args:
+            candidate: the pair.
+            database: own keyframes.
+            sample: of the neighbor's keyframe.
+            seed: of this run.
+        """
+        own = candidate.own_keyframe
+        ours = database.features[own], database.rectified(own)
+        theirs = sample.features, self.features[candidate.peer_keyframe]
+        return verify(
+            candidate,
+            ours[0],
+            database.pyramid(own),
+            sample,
+            config=database.config.verification,
+            rng=_stream(seed, ours, theirs),
+            rectified=(ours[1], theirs[1]),
+        )
+
+
+def most_alike(
+    inliers: Mapping[tuple[int, int], int], known: Collection[tuple[int, int]], most: int
+) -> list[tuple[int, int]]:
+    """Of every keyframe of the neighbor the own ones with most features in common, but those of known loop closures.
+
+    Args:
+        inliers: features that agree, by own keyframe and the neighbor's.
+        known: pairs that are loop closures.
+        most: of a keyframe of the neighbor.
+    """
+    by_peer: dict[int, list[tuple[int, int]]] = {}
+    for own, peer in sorted(inliers, key=lambda ends: (-inliers[ends], ends)):
+        by_peer.setdefault(peer, []).append((own, peer))
+    return sorted(ends for pairs in by_peer.values() for ends in pairs[:most] if ends not in known)
+
+
+def _stream(
+    seed: int, ours: tuple[Features, Features], theirs: tuple[Features, Features]
+) -> np.random.Generator:
+    return random_streams.generator(seed, "ransac.rectified", own=digest_of(*ours), peer=digest_of(*theirs))
 
 
 def digest_of(*features: Features) -> str:

@@ -123,6 +123,23 @@ def motion_from_features(
     return _motion_of_points(points_first, points_second, config, rng)
 
 
+def motion_from_rectified(
+    first: tuple[Features, Features],
+    second: tuple[Features, Features],
+    config: GeometricVerificationConfig,
+    rng: np.random.Generator,
+) -> FeatureMotion:
+    """`motion_from_features` by features of both kinds.
+
+    Args:
+        first: features of the first view, as it is and rectified.
+        second: the same of the second view.
+        config: ratio test, RANSAC, inliers needed.
+        rng: draws the samples of RANSAC.
+    """
+    return _motion_of_points(*matched_points(first, second, config.ratio), config, rng)
+
+
 def _motion_of_points(
     points_first: Array, points_second: Array, config: GeometricVerificationConfig, rng: np.random.Generator
 ) -> FeatureMotion:
@@ -264,7 +281,7 @@ def verify(
         found = motion_from_features(first.features, second.features, config, rng)
     else:
         ours, theirs = (first.features, first.rectified), (second.features, second.rectified)
-        found = _motion_of_points(*matched_points(ours, theirs, config.ratio), config, rng)
+        found = motion_from_rectified(ours, theirs, config, rng)
 
     def failed(failure: Failure, result: Registration | None = None) -> GeometricVerification:
         return GeometricVerification(failure, found, result, np.eye(4), np.zeros((6, 6)))

@@ -32,10 +32,13 @@ SAME_NORMAL = np.cos(np.radians(20))
 FACED = np.cos(np.radians(25))  # surfaces that the camera sees less from the side are left as they are
 FARTHEST = np.tan(np.radians(80))  # from the middle of a turned image
 LEAST_SHARE = 0.04  # of the coarse pixels that share a normal
-TRIED = 400  # normals, evenly spread, of which the one that most others share is taken
+TRIED, VOTERS = (
+    100,
+    2000,
+)  # normals, evenly spread: the one of the first that most of the others share is taken
 ROUNDS = 3  # of taking the mean of those that share it
 OUTSIDE = 2  # percent of the pixels on either side that a turned image does without
-MOST_PX = 400_000  # of a turned image
+MOST_PX = 150_000  # of a turned image: three times as many find no more loop closures
 STEPS = 32  # of a pixel, by which images are interpolated
 SAME_POINT = 0.02
 """Matches whose points are nearer to each other than this, at one meter, in both views, count once."""
@@ -88,8 +91,8 @@ def _facings(pyramid: RgbdPyramid, most: int) -> list[_Facing]:
     least, out = LEAST_SHARE * left.size, list[_Facing]()
     while len(out) < most and left.sum() > least:
         among = normals[left]
-        tried = among[:: -(-len(among) // TRIED)]
-        votes = [int((_dot(among, one) > SAME_NORMAL).sum()) for one in tried]
+        tried, voters = (among[:: -(-len(among) // most)] for most in (TRIED, VOTERS))
+        votes = [int((_dot(voters, one) > SAME_NORMAL).sum()) for one in tried]
         normal = tried[int(np.argmax(votes))]
         for _ in range(ROUNDS):
             normal = among[_dot(among, normal) > SAME_NORMAL].sum(axis=0)

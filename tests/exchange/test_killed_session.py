@@ -11,11 +11,17 @@ import pytest
 from duagc.pipeline.base import recall
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.config.exchange import ExchangeConfig
-from duagc.pipeline.exchange import detected_loop_closures, sharing
+from duagc.pipeline.exchange import detected_loop_closures, keyframe_database, sharing
+from duagc.pipeline.exchange.rectified_search import RectifiedSearch
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.recording import content_digest
 
-SLOW = {detected_loop_closures: ("extract", "verify"), sharing: ("own_records", "match_pairs")}
+SLOW: dict[Any, tuple[str, ...]] = {
+    keyframe_database: ("extract", "extract_rectified"),
+    detected_loop_closures: ("verify",),
+    RectifiedSearch: ("compare",),
+    sharing: ("own_records", "match_pairs"),
+}
 
 
 class KilledError(Exception):
@@ -34,15 +40,25 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
         return call
 
-    for module, names in SLOW.items():
+    for owner, names in SLOW.items():
         for name in names:
-            monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
+            monkeypatch.setattr(owner, name, counted(name, getattr(owner, name)))
     monkeypatch.setattr(recall, "WORTH_S", 0.0)
     return made
 
 
-def test_nothing_slow_is_computed_twice(make_robot: Any, tmp_path: Path, calls: list[str]) -> None:
-    team = [make_robot(name, 0.6 * i, keyframes=4)[0] for i, name in enumerate(("alpha", "bravo"))]
+@pytest.mark.parametrize(
+    ("turn_rad", "slow"),
+    [
+        (0.6, {"extract", "verify", "own_records", "match_pairs"}),
+        (3.0, {"extract", "extract_rectified", "compare", "own_records"}),
+    ],
+    ids=["joined", "strangers"],
+)
+def test_nothing_slow_is_computed_twice(
+    make_robot: Any, tmp_path: Path, calls: list[str], turn_rad: float, slow: set[str]
+) -> None:
+    team = [make_robot(name, turn_rad * i, keyframes=4)[0] for i, name in enumerate(("alpha", "bravo"))]
     said: list[str] = []
 
     def meet(folder: Path, most: float, checkpoints: Path | None) -> str | None:
@@ -70,7 +86,7 @@ def test_nothing_slow_is_computed_twice(make_robot: Any, tmp_path: Path, calls: 
 
     expected = meet(tmp_path / "undisturbed", math.inf, None)
     once = sorted(calls)
-    assert set(once) == {"extract", "verify", "own_records", "match_pairs"}
+    assert set(once) == slow
     calls.clear()
     killed = [meet(tmp_path / "killed", most, tmp_path / "saved") for most in (3, 8, len(once) - 1)]
     assert killed == [None] * 3

@@ -203,9 +203,7 @@ def test_where_nothing_tells_which_link_is_false_nobody_is_put_anywhere(
 ) -> None:
     """Rooms that are alike in every image: the cycle of the three does not close, and that is all that is known."""
     more_false_than_true(monkeypatch)
-    monkeypatch.setattr(
-        "duagc.pipeline.exchange.detected_loop_closures.surface_agreement", lambda *_, **__: 0.6
-    )
+    monkeypatch.setattr("duagc.pipeline.exchange.keyframe_database.surface_agreement", lambda *_, **__: 0.6)
     config = {"link": LinkConfig(loss_probability=loss)}
     results = meet(team, NAMES, tmp_path, **config)
     for name in NAMES:

@@ -82,7 +82,7 @@ def robots(make_robot: Any) -> list[Any]:
 
 def search(robots: list[Any], min_score: int, blind: bool = False) -> tuple[Verifier, list[int]]:
     """Let both ends talk until they have decided; the verifier, and the keyframes that were requested."""
-    config = ExchangeConfig(places=PlacesConfig(min_score=min_score))
+    config = ExchangeConfig(places=PlacesConfig(min_score=min_score, rectified_planes=0))
     alpha, bravo = (KeyframeDatabase(data, config) for data in robots)
     verifier, provider = Verifier(alpha, "bravo", 0), Provider(bravo, "alpha", 0)
     if blind:
