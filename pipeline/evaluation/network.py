@@ -38,6 +38,8 @@ PURPOSE = {  # of a message, by its kind
     "DESCRIPTORS": "set-up",
     "REQUEST": "set-up",
     "SAMPLE": "set-up",
+    "RECTIFIED_REQUEST": "set-up",
+    "RECTIFIED": "set-up",
     "CLOSURES": "set-up",
     "RELATIVE_FRAME": "set-up",
     "VOXELS": "set-up",

@@ -15,6 +15,7 @@ from duagc.pipeline.evaluation import network
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.exchange.record import RawAlternative, read_session
 from duagc.pipeline.exchange.session import run_session_of
+from duagc.pipeline.network.packets import Kind
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.runs.robot_data import RobotData
 from duagc.schemas import topics
@@ -93,3 +94,8 @@ def test_a_robot_that_ends_alone_needs_no_rounds(monkeypatch: pytest.MonkeyPatch
     late = ticks(rounds[:-1])
     assert isinstance(late, Absent)
     assert late.reason == "charlie did not get there in 10 rounds"
+
+
+def test_every_kind_of_message_of_a_run_has_a_purpose() -> None:
+    """KEYFRAMES alone is of `duagc posegraph`."""
+    assert set(network.PURPOSE) == {kind.name for kind in Kind} - {"KEYFRAMES"}
