@@ -166,13 +166,16 @@ def matches(ours: Descriptors, theirs: Descriptors, ratio: float) -> NDArray[np.
     Returns:
         Pairs (index in ours, index in theirs), int64 [k, 2], by index in theirs.
     """
-    if len(ours) < 2 or not len(theirs):
-        return np.zeros((0, 2), dtype=np.int64)
-    return _matches(_squared_distances(ours, theirs), ratio)
+    return matches_of(squared_distances(ours, theirs), ratio)
 
 
-def _squared_distances(ours: Descriptors, theirs: Descriptors) -> NDArray[np.float32]:
-    """[n, m], exact integers."""
+def squared_distances(ours: Descriptors, theirs: Descriptors) -> NDArray[np.float32]:
+    """Between descriptors, [n, m], exact integers.
+
+    Args:
+        ours: uint8 [n, 128].
+        theirs: uint8 [m, 128].
+    """
     a, b = ours.astype(np.float32), theirs.astype(np.float32)
     squared = a @ b.T
     squared *= -2
@@ -181,8 +184,15 @@ def _squared_distances(ours: Descriptors, theirs: Descriptors) -> NDArray[np.flo
     return squared
 
 
-def _matches(squared: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
-    """`matches` by squared distances [n, m], which are changed."""
+def matches_of(squared: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
+    """`matches` by squared distances.
+
+    Args:
+        squared: [n, m], as of `squared_distances`; they are changed.
+        ratio: as of `matches`.
+    """
+    if len(squared) < 2 or not squared.shape[1]:
+        return np.zeros((0, 2), dtype=np.int64)
     columns = np.arange(squared.shape[1])
     best = squared.argmin(axis=0)
     mutual = squared.argmin(axis=1)[best] == columns

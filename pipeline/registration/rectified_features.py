@@ -22,8 +22,9 @@ from duagc.pipeline.registration.features import (
     Descriptors,
     Features,
     brightened,
-    matches,
+    matches_of,
     root_sift,
+    squared_distances,
 )
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
@@ -216,9 +217,10 @@ def matched_points(
         ratio: of the ratio test.
     """
     points = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for ours in first:
-        for theirs in second:
-            pairs = matches(ours.descriptors, theirs.descriptors, ratio)
+    squared = squared_distances(*(np.concatenate([f.descriptors for f in view]) for view in (first, second)))
+    for ours, rows in zip(first, np.split(squared, [len(first[0])]), strict=True):
+        for theirs, kind in zip(second, np.split(rows, [len(second[0])], axis=1), strict=True):
+            pairs = matches_of(kind, ratio)
             points[0].append(ours.points[pairs[:, 0]].astype(np.float64))
             points[1].append(theirs.points[pairs[:, 1]].astype(np.float64))
     a, b = (np.concatenate(parts) for parts in points)

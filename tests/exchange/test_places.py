@@ -38,7 +38,7 @@ def test_matching_bytes_is_exact() -> None:
     rng = np.random.default_rng(0)
     a, b = (rng.integers(0, 256, (50, 128)).astype(np.uint8) for _ in range(2))
     exact = ((a[:, None].astype(np.int64) - b.astype(np.int64)) ** 2).sum(axis=-1)
-    assert np.array_equal(features._squared_distances(a, b), exact)
+    assert np.array_equal(features.squared_distances(a, b), exact)
 
 
 def test_a_descriptor_matches_itself_only() -> None:
