@@ -59,6 +59,11 @@ class PeerValidationConfig(Config):
     """Blending weight, in pixels, from which on a single Gaussian is judged."""
     min_overlap: float = Field(default=0.01, ge=0.0, le=1.0)
     """Share of the own pixels from which on a peer's map is judged as a whole."""
+    max_contradicted: float = Field(default=0.2, ge=0.0, le=1.0)
+    """Share of the Gaussians that own images judge, up to which a map that explains too little because of those that
+    they contradict is judged without these."""
+    min_explained_by_rest: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Share of the variance that it must explain then."""
     passes: int = Field(default=2, ge=1)
     """Times that the map is rendered; Gaussians behind a contradicted one are judged in the next pass."""
     max_size_ratio: float = Field(default=2.0, gt=0.0)

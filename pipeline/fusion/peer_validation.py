@@ -9,7 +9,9 @@ over pixels at which the peer's surface lies in front of the measured one or on 
 no evidence. Colors are those that the own camera would show (`consensus.colors`, by the matches of this pair alone).
 A Gaussian is contradicted if its pixels are rendered worse than by one gray for everything: its error is above the
 variance of the own images. A peer as a whole is contradicted if its map does not explain some of the variance of the
-pixels that it was judged on. What no own keyframe saw cannot be judged.
+pixels that it was judged on, neither as it is nor, if they are few, without the Gaussians that are contradicted: where
+a camera measures no depth, honest maps hold Gaussians that are right in that camera's own views alone.
+What no own keyframe saw cannot be judged.
 
 Matches are checked, too, because the lower-named robot of a pair decides on them: two Gaussians that are not near each
 other, or differ more than neighbors in the own map do, are no match.
@@ -294,6 +296,7 @@ class _PhotometricCheck:
         self.views, self.context, self.depth_kind, self.config = views, context, depth_kind, config
         self.rasterizer = Rasterizer(threads=context.threads)
         self.own, self.color_mse = _ColorStatistics(config.min_color_variance), 0.0
+        self._seen_px = 0  # that saw the whole map
         self.num_contradicted = 0
 
     def trusted(self, own_px: int) -> bool:
@@ -301,21 +304,33 @@ class _PhotometricCheck:
 
         Of a map with holes as much is expected as there is of it; what is wrong explains nothing, however little it is.
         """
-        explains = self.color_mse <= (1 - self.explained) * self.own.variance
-        return explains or self.own.pixels < self.config.min_overlap * own_px
+        return self._explains or self._seen_px < self.config.min_overlap * own_px
+
+    @property
+    def _explains(self) -> bool:
+        """Whether the colors of the map explain enough where it is seen."""
+        return self.color_mse <= (1 - self.explained) * self.own.variance
 
     def contradicted(self, world: Evidence, gray: float) -> NDArray[np.bool_]:
         """Which Gaussians [n] own images contradict: error above `gray`, the variance of own colors."""
         gaussians = gaussians_of(world.ids, world.anchors, world.theta)
-        against = np.zeros(len(world), bool)
+        against, judged = np.zeros((2, len(world)), bool)
         for turn in range(self.config.passes):
             rows = np.flatnonzero(~against)
-            errors = self._errors(gaussians.select(rows), first=turn == 0)
+            errors = self._errors(gaussians.select(rows), count=turn == 0)
             against[rows[errors > gray]] = True
+            judged[rows[errors > 0]] = True
+        self._seen_px = self.own.pixels
+        false_share = np.sum(against) / max(np.sum(judged), 1)
+        if not self._explains and false_share <= self.config.max_contradicted:  # what is not used may be why
+            self._errors(gaussians.select(~against), count=True)
+            self.explained = max(self.explained, self.config.min_explained_by_rest)
         return against
 
-    def _errors(self, gaussians: Gaussians, first: bool) -> Array:
-        """Mean squared error of the pixels of each Gaussian [n], zero of too few."""
+    def _errors(self, gaussians: Gaussians, *, count: bool) -> Array:
+        """Mean squared error of the pixels of each Gaussian [n], zero of too few; `count`: own colors there, anew."""
+        if count:
+            self.own = _ColorStatistics(self.config.min_color_variance)
         errors, weights = np.zeros(len(gaussians)), np.zeros(len(gaussians))
         total, fusion, least = 0.0, self.context.config, self.config.min_opacity
         for view in self.views:
@@ -336,9 +351,9 @@ class _PhotometricCheck:
             sums = self.rasterizer.backward(images).colors  # of weight times image, over the pixels
             errors, weights = errors + sums[:, 0], weights + sums[:, 1]
             total += float(images[..., 0].sum(dtype=np.float64))
-            if first:
+            if count:
                 self.own.add(view.unit_color[judged])
-        if first:
+        if count:
             self.color_mse = total / max(self.own.pixels, 1)
         least_px = self.config.min_gaussian_px
         return np.where(weights >= least_px, errors / np.maximum(weights, least_px), 0.0)

@@ -236,3 +236,17 @@ def test_without_neighbors_of_its_own_a_robot_believes_matches_of_two_peers(view
         arrived=dict.fromkeys(peers, 1.0),
     )
     assert len(validated.pairs["bravo", "charlie"]) > 0.9 * N
+
+
+@pytest.mark.parametrize(("veils", "trusted"), [(60, True), (150, False)])
+def test_what_is_contradicted_counts_once(views, veils, trusted):
+    """Gaussians in free space that hide much of the map do not make the rest a lie, unless they are many."""
+    rng = np.random.default_rng(1)
+    at = np.column_stack([rng.uniform(-1.2, 1.2, (veils, 2)), rng.uniform(0.9, 1.1, veils)])
+    few = [(tuple(center), 0.08, tuple(rng.integers(0, 2, 3))) for center in at]
+    validated = validated_by_alpha(views, map_of("bravo", discs=few))
+    (check,) = validated.checks
+    assert check.trusted == trusted
+    used = validated.uncontradicted["bravo"].ids if trusted else []
+    assert len(used) > 0.8 * N or not trusted
+    assert not trusted or check.color_mse < 0.5 * check.color_variance
