@@ -50,7 +50,7 @@ class _Facing:
     """Coarse pixels that share a normal.
 
     Attributes:
-        normal: [3], unit vector towards the camera.
+        normal: [3], unit vector toward the camera.
         members: bool [h, w], of the coarse image.
     """
 
