@@ -30,7 +30,7 @@ from duagc.pipeline.base.recall import Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.exchange import injection, place_recognition
-from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
+from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase, digest_of
 from duagc.pipeline.exchange.loop_closing import (
     JoinedPair,
     LoopClosureProtocol,
@@ -40,7 +40,7 @@ from duagc.pipeline.exchange.loop_closing import (
     join,
 )
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
-from duagc.pipeline.exchange.rectified_search import RectifiedSearch, digest_of, most_alike
+from duagc.pipeline.exchange.rectified_search import RectifiedSearch, most_alike
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import (

@@ -103,8 +103,7 @@ class KeyframeDatabase:
     @property
     def digest(self) -> bytes:
         """Eight bytes that depend on what the robot saw, and on nothing else."""
-        whole = hashlib.sha256(b"".join(f.descriptors.tobytes() for f in self.features))
-        return whole.digest()[: loop_closing_wire.DIGEST_BYTES]
+        return bytes.fromhex(digest_of(*self.features))[: loop_closing_wire.DIGEST_BYTES]
 
     def descriptors(self) -> DescriptorSet:
         """What a neighbor gets to recognize places."""
@@ -116,3 +115,12 @@ class KeyframeDatabase:
         """What a neighbor gets to verify loop closures with one keyframe."""
         reference = Reference.sample(self.pyramid(keyframe), self.config.verification.samples)
         return KeyframeSample(keyframe, self.features[keyframe], reference)
+
+
+def digest_of(*features: Features) -> str:
+    """SHA-256 of descriptors, which names what a robot or a view shows.
+
+    Args:
+        features: of some views, or of several kinds.
+    """
+    return hashlib.sha256(b"".join(f.descriptors.tobytes() for f in features)).hexdigest()

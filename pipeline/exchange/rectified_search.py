@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
+from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase, digest_of
 from duagc.pipeline.exchange.loop_closing import Tried
 from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.verification import Verified, verify
@@ -38,6 +37,8 @@ class RectifiedSearch:
     def take(self, found: RectifiedFeatures) -> None:
         """Features of one keyframe.
 
+        Args:
+            found: as they arrived.
         Raises:
             MalformedError: they were not requested, or came twice.
         """
@@ -113,12 +114,3 @@ def _stream(
     seed: int, ours: tuple[Features, Features], theirs: tuple[Features, Features]
 ) -> np.random.Generator:
     return random_streams.generator(seed, "ransac.rectified", own=digest_of(*ours), peer=digest_of(*theirs))
-
-
-def digest_of(*features: Features) -> str:
-    """What a random stream of a pair of views is named by.
-
-    Args:
-        features: of one view.
-    """
-    return hashlib.sha256(b"".join(f.descriptors.tobytes() for f in features)).hexdigest()

@@ -33,10 +33,8 @@ SAME_NORMAL = np.cos(np.radians(20))
 FACED = np.cos(np.radians(25))  # surfaces that the camera sees less from the side are left as they are
 FARTHEST = np.tan(np.radians(80))  # from the middle of a turned image
 LEAST_SHARE = 0.04  # of the coarse pixels that share a normal
-TRIED, VOTERS = (
-    100,
-    2000,
-)  # normals, evenly spread: the one of the first that most of the others share is taken
+TRIED = 100  # normals, evenly spread, of which the one that most voters share is taken
+VOTERS = 2000  # normals, evenly spread
 ROUNDS = 3  # of taking the mean of those that share it
 OUTSIDE = 2  # percent of the pixels on either side that a turned image does without
 MOST_PX = 150_000  # of a turned image: three times as many find no more loop closures
@@ -67,8 +65,8 @@ def extract_rectified(gray: NDArray[np.uint8], pyramid: RgbdPyramid, most: int, 
         most: number of features kept.
         planes: most directions that the camera is turned to.
     """
-    fine = pyramid.levels[0]
-    found = [_features_of(gray, pyramid, facing, most) for facing in _facings(pyramid, planes)]
+    fine, bright = pyramid.levels[0], brightened(gray)
+    found = [_features_of(bright, pyramid, facing, most) for facing in _facings(pyramid, planes)]
     descriptors, pixels, response = (
         np.concatenate(parts)
         for parts in zip(
@@ -118,7 +116,7 @@ def _features_of(
     view = _TurnedView.of(facing, pyramid)
     if view is None:
         return none
-    keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(view.image(brightened(gray)), None)
+    keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(view.image(gray), None)
     if not keypoints:
         return none
     u, v = view.pixels(np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2))

@@ -250,8 +250,7 @@ def read_sample(data: bytes, limit: int) -> KeyframeSample:
         raise MalformedError(f"sample: keyframe {keyframe}, expected one below {limit}")
     if not (0 <= feature_scale < 1 and 0 <= sample_scale < 1) or not 1 <= levels <= 8:
         raise MalformedError("sample: impossible scale of points or number of levels")
-    descriptors = reader.array("uint8", (n, DIMENSIONS))
-    points = reader.array("int16", (n, 3)).astype(np.float32) * np.float32(feature_scale)
+    features = _features(reader, n, feature_scale)
     sample_points = reader.array("int16", (m, 3)).astype(np.float32) * np.float32(sample_scale)
     normals = reader.array("int8", (m, 3)).astype(np.float32)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -261,7 +260,7 @@ def read_sample(data: bytes, limit: int) -> KeyframeSample:
     grays = [reader.array("uint8", (m,)).astype(np.float32) / np.float32(255) for _ in range(levels)]
     reader.done()
     reference = Reference(tuple(ReferenceLevel(sample_points, normals, gray) for gray in grays))
-    return KeyframeSample(keyframe, Features(descriptors, points), reference)
+    return KeyframeSample(keyframe, features, reference)
 
 
 @dataclass(frozen=True)
@@ -296,10 +295,15 @@ def read_rectified(data: bytes, limit: int) -> RectifiedFeatures:
         raise MalformedError(
             f"rectified: keyframe {keyframe}, expected one below {limit}, or a scale not below 1"
         )
-    descriptors = reader.array("uint8", (n, DIMENSIONS))
-    points = reader.array("int16", (n, 3)).astype(np.float32) * np.float32(scale)
+    features = _features(reader, n, scale)
     reader.done()
-    return RectifiedFeatures(keyframe, Features(descriptors, points))
+    return RectifiedFeatures(keyframe, features)
+
+
+def _features(reader: Reader, n: int, scale: float) -> Features:
+    """The next n features, points in steps of `scale` meters."""
+    descriptors = reader.array("uint8", (n, DIMENSIONS))
+    return Features(descriptors, reader.array("int16", (n, 3)).astype(np.float32) * np.float32(scale))
 
 
 def _shorts(points: NDArray[np.float32]) -> tuple[float, bytes]:
