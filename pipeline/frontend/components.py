@@ -27,7 +27,8 @@ class Component:
         keyframes: in the order of time, numbered from 0.
         pairs: registrations and loop closures between them.
         closures: by number of a submap, how many loop closures tie it to others.
-        index_of: place of a keyframe by (number of the submap, index there).
+        index_of: place of a keyframe by (number of the submap, index there); none of one that was rejected and is in a
+            component of its own.
     """
 
     numbers: tuple[int, ...]

@@ -200,7 +200,7 @@ def submap_messages(robot: str, component: Component, log: TrackedLog) -> list[S
                 first_frame=frames[0],
                 last_frame=frames[-1],
                 frames=len(frames),
-                keyframes=len(submap.keyframes),
+                keyframes=sum(number == submap.number for number, _ in component.index_of),
                 loop_closures=component.closures[submap.number],
             )
         )

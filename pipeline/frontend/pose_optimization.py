@@ -1,8 +1,8 @@
 """Keyframe poses of a path: joint optimization with loop closures, then the judgment by features and depth.
 
 Where features contradict the poses of two keyframes, the motion that they agree on takes the place of what tracking
-found, and all is optimized again. What is contradicted even then is no keyframe, and the frames that are anchored to it
-are lost.
+found, and all is optimized again. What is contradicted even then is rejected: the frames that are anchored to it are
+lost here, and what is contradicted as a whole may go on by itself (`rejected_parts`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from duagc.pipeline.frontend.judgment import Judgment, judge
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pose_graph
 from duagc.pipeline.frontend.loop_outliers import consistent_loops
 from duagc.pipeline.frontend.lost_frames import found_afterwards
+from duagc.pipeline.frontend.rejected_parts import RejectedPart
 from duagc.pipeline.frontend.submaps import lost
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -36,12 +37,14 @@ class OptimizedPath:
         frames: every frame; lost if its keyframe was rejected.
         solution: poses of the keyframes.
         factors: of their pose graph.
+        rejected: parts of the path before, the first one first.
     """
 
     keyframes: list[TrackedKeyframe]
     frames: list[TrackedFrame]
     solution: OptimizedKeyframes
     factors: Sequence[RelativePose]
+    rejected: Sequence[RejectedPart] = ()
 
 
 @dataclass(frozen=True)
@@ -110,9 +113,11 @@ class PathOptimization:
         judgment = self._judged(path, 2)
         if not judgment.contradicted:
             return path
-        path, pairs = _without_rejected(path, judgment.corrected(pairs), judgment.contradicted)
+        pairs = judgment.corrected(pairs)
+        rejected = _rejected(path, pairs, judgment)
+        path, pairs = _without_rejected(path, pairs, judgment.contradicted)
         solution, factors = self._optimized(path.keyframes, pairs, 3)
-        return replace(path, solution=solution, factors=factors)
+        return replace(path, solution=solution, factors=factors, rejected=rejected)
 
     def _judged(self, path: OptimizedPath, attempt: int) -> Judgment:
         part = f"{self.part}.judgment{attempt}"
@@ -178,6 +183,21 @@ class PathOptimization:
             checkpoints=self.checkpoints,
             part=f"{part}.bundle",
         )
+
+
+def _rejected(path: OptimizedPath, pairs: Sequence[RelativePose], judgment: Judgment) -> list[RejectedPart]:
+    """The parts of a path that were contradicted, each with the pairs that may be true within it."""
+    members: dict[int, list[int]] = {}
+    for keyframe in judgment.contradicted:
+        members.setdefault(judgment.parts[keyframe], []).append(keyframe)
+    return [
+        RejectedPart(
+            sorted(part),
+            path.solution.T_map_keyframe[sorted(part)],
+            [pair for pair in pairs if pair.i in part and pair.j in part],
+        )
+        for _, part in sorted(members.items())
+    ]
 
 
 def _without_rejected(

@@ -23,14 +23,12 @@ from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.frontend.bundle import Images
-from duagc.pipeline.frontend.components import Component
+from duagc.pipeline.frontend.component_paths import ComponentPath, images_of, optimized_paths, trajectories_of
 from duagc.pipeline.frontend.depth_delay import certain_delay_ns
 from duagc.pipeline.frontend.depth_quality import depth_noise_m, largest_depth_offset_s, median_depth_m
 from duagc.pipeline.frontend.exposure import ExposureEstimation
 from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector
-from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
-from duagc.pipeline.frontend.kept_pyramids import KeptPyramids
+from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
 from duagc.pipeline.frontend.lost_frames import registered_again
 from duagc.pipeline.frontend.other_tracker import OtherTracker
@@ -44,7 +42,6 @@ from duagc.pipeline.frontend.output import (
     submap_messages,
     write_log,
 )
-from duagc.pipeline.frontend.pose_optimization import OptimizedPath, PathOptimization
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
@@ -52,12 +49,10 @@ from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyfram
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.view_poses import moved_factors
 from duagc.pipeline.geometry.exposure import ExposureTrack
-from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.recording import MotionPrior, RgbdLog, open_rgbd
 from duagc.pipeline.recording.moved_depth import DELAY_KEY
 from duagc.pipeline.recording.shutter import FOUND_KEY
-from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.splat.gaussians import Gaussians
 
 
@@ -114,10 +109,11 @@ def run_frontend(
         of_maps = config.model_copy(update={"mapping": config.mapping.for_depth(depth_m)})
         clock.lap("tracking_s")
         components = save.done(
-            "joined", lambda: join_submaps(tracked.submaps, _images(log), config, seed=seed, robot=log.robot)
+            "joined",
+            lambda: join_submaps(tracked.submaps, images_of(log), config, seed=seed, robot=log.robot),
         )
-        frames = [component.frames(tracked) for component in components]
-        for name, at in _named(log.robot, components, frames):
+        paths = optimized_paths(log, components, tracked, config, seed=seed, checkpoints=save)
+        for name, at in _named(log.robot, paths):
             stage = _ComponentStage(
                 log=log,
                 name=name,
@@ -130,8 +126,7 @@ def run_frontend(
                 clock=clock,
                 checkpoints=save,
             )
-            path = out_path if name == log.robot else component_path(out_path, name)
-            stage.run(components[at], frames[at], tracked, path)
+            stage.run(paths[at], out_path if name == log.robot else component_path(out_path, name))
     return clock.laps
 
 
@@ -145,13 +140,15 @@ def component_path(frontend: Path, name: str) -> Path:
     return frontend.with_name(f"{frontend.stem}.{submap_of(name)}{frontend.suffix}")
 
 
-def _named(
-    robot: str, components: Sequence[Component], frames: Sequence[Sequence[TrackedFrame]]
-) -> list[tuple[str, int]]:
+def _named(robot: str, paths: Sequence[ComponentPath]) -> list[tuple[str, int]]:
     """Names of components and their places: the one with most frames has the robot's name, others their number too."""
-    posed = [sum(frame.status is not Status.LOST for frame in of_component) for of_component in frames]
+    posed = [sum(frame.status is not Status.LOST for frame in path.tracked_frames) for path in paths]
     largest = int(np.argmax(posed))  # the first of equals
-    others = [(component_name(robot, c.numbers[0]), at) for at, c in enumerate(components) if at != largest]
+    others = [
+        (component_name(robot, path.component.numbers[0]), at)
+        for at, path in enumerate(paths)
+        if at != largest
+    ]
     return [(robot, largest), *others]
 
 
@@ -185,7 +182,7 @@ class _Tracking:
             log.delay_depth(delay_ns)
         tracked = save.done("tracked", lambda: self._leading(self._again(first)))
         if tracked.submaps[0].keyframes:
-            log.move_depth(*_trajectories(tracked))
+            log.move_depth(*trajectories_of(tracked))
         return tracked
 
     def _leading(self, tracked: TrackedLog) -> TrackedLog:
@@ -196,11 +193,11 @@ class _Tracking:
     def _delay_ns(self, tracked: TrackedLog) -> int:
         if not tracked.submaps[0].keyframes:
             return 0
-        return certain_delay_ns(self.log, _trajectories(tracked), self.config.delay)
+        return certain_delay_ns(self.log, trajectories_of(tracked), self.config.delay)
 
     def _again(self, tracked: TrackedLog) -> TrackedLog:
         if self.log.needs_motion and tracked.submaps[0].keyframes:
-            self.log.move_depth(*_trajectories(tracked))
+            self.log.move_depth(*trajectories_of(tracked))
             return self._frames("tracking again")
         return tracked
 
@@ -236,27 +233,9 @@ class _Tracking:
         return Open3dTracker(camera, config, self.log.frame)
 
 
-def _trajectories(tracked: TrackedLog) -> list[Trajectory]:
-    """T_submap_camera of the frames that have a pose, by submap."""
-    out = []
-    for submap in tracked.submaps:
-        frames = [f for f, n in zip(tracked.frames, tracked.submap_of, strict=True) if n == submap.number]
-        out.append(tracked_path(frames, np.array([k.T_map_keyframe for k in submap.keyframes])))
-    return out
-
-
-def _images(log: RgbdLog) -> Images:
-    """Reads the images of a frame, by its index and the number of pyramid levels, as long as no depth is moved."""
-
-    def images(frame_index: int, levels: int) -> RgbdPyramid:
-        return pyramid_of(log.frame(frame_index), log.camera, levels)
-
-    return KeptPyramids(images)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _ComponentStage:
-    """From the submaps of a component to its log.
+    """From the path of a component to its log.
 
     Attributes:
         log: of the robot.
@@ -282,34 +261,24 @@ class _ComponentStage:
     clock: LapTimes
     checkpoints: Checkpoints
 
-    def run(self, component: Component, frames: list[TrackedFrame], tracked: TrackedLog, path: Path) -> None:
-        """Optimize the poses, map, and write the log.
+    def run(self, path: ComponentPath, out_path: Path) -> None:
+        """Map, and write the log.
 
         Args:
-            component: keyframes and pose graph.
-            frames: every frame of the log.
-            tracked: the log as it was tracked.
-            path: of the log.
+            path: of the component.
+            out_path: of its log.
         """
-        log, clock, save = self.log, self.clock, self.checkpoints
-        log.move_depth(*_trajectories(tracked))  # those of another component say nothing of these frames
-        part = f"{self.name}.poses"
-
-        def optimize() -> OptimizedPath:
-            optimization = PathOptimization(_images(log), self.config, self.seed, log.robot, save, part)
-            return optimization.run(component.keyframes, frames, component.pairs)
-
-        optimized = save.done(part, optimize)  # the images that it kept are gone now
-        solution, tracked_frames, frames = optimized.solution, frames, optimized.frames
+        log, clock, save, optimized = self.log, self.clock, self.checkpoints, path.optimized
+        solution, frames = optimized.solution, optimized.frames
         log.move_depth(tracked_path(frames, solution.T_map_keyframe))
         if log.needs_motion:
             frames = save.done(
-                f"{part}.found",
+                f"{self.name}.poses.found",
                 lambda: registered_again(
                     optimized.frames,
-                    tracked_frames,
+                    path.tracked_frames,
                     optimized.keyframes,
-                    _images(log),
+                    images_of(log),
                     config=self.config,
                 ),
             )
@@ -341,14 +310,14 @@ class _ComponentStage:
             notes[FOUND_KEY] = repr(built.shutter_s)
         odometry = [odometry_message(self.name, frame, refined.T_map_keyframe) for frame in built.frames]
         write_log(
-            path,
+            out_path,
             self.name,
             odometry,
             keyframes=keyframe_messages(self.name, optimized.keyframes, refined),
             factors=factor_messages(self.name, optimized.keyframes, moved, refined),
             exposures=exposure_messages(self.name, exposures, odometry),
             updates=built.updates,
-            submaps=submap_messages(self.name, component, tracked),
+            submaps=submap_messages(self.name, path.component, path.log),
             maps=built.maps,
             notes=notes,
         )

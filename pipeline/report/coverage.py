@@ -36,7 +36,7 @@ REASONS = {
     "unconfirmed": "not recognized, or not yet confirmed",
     "contradicted_by_features": "matched features contradict the pose",
     "contradicted_by_depth": "depth contradicts the pose",
-    "other_component": "its keyframe was given up",
+    "other_component": "in a component of its own",
     "small_submap": "in a first submap that remained too small",
 }
 
