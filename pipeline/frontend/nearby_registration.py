@@ -30,9 +30,24 @@ def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate 
     for candidate, checks in _attempts(state, frame):
         found = verify(checks, state, frame, candidate)
         if isinstance(found, PoseCandidate):
-            return found
+            return _looking_as_usual(state, frame, found)
         reason = reason if reason is not Reason.NONE else found
     return reason
+
+
+def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> PoseCandidate:
+    """What was found, or where features have the frame, if it looks as usual there and does not where it was found."""
+    if not state.looks_worse_than_usual(found):
+        return found
+    tracking = state.config.tracking
+    for index, guess in initial_motions(state, frame):
+        result = register_until_stable(
+            state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
+        )
+        other = verify(FOUND_NEARBY, state, frame, PoseCandidate(index, result))
+        if isinstance(other, PoseCandidate) and not state.looks_worse_than_usual(other):
+            return other
+    return found
 
 
 def _attempts(

@@ -218,6 +218,21 @@ class FeaturesDoNotContradict:
         return Reason.OBSTRUCTED if found is not None and contradicts(found, limits) else candidate
 
 
+class UnlikeWhereFeaturesHaveIt:
+    """A frame that looks worse than usual must be where features have it, if they agree on a motion at all.
+
+    Dense registration ends in a wrong minimum where the camera moved other than predicted by more than it reaches: a
+    view along a wall, which only its pictures tell from the next one, was taken to be 6 cm off.
+    """
+
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
+        if not state.looks_worse_than_usual(candidate):
+            return candidate
+        return FeaturesDoNotContradict().judge(state, frame, candidate)
+
+
 def _features_prefer(T: Array, T_other: Array, keyframe: TrackedKeyframe, frame: CurrentFrame) -> bool:
     """Whether features say that the camera is at T rather than at T_other.
 
@@ -257,7 +272,12 @@ def _from_prediction(
     return float(moved_m[nearest]), float(turned_rad[nearest])
 
 
-FOLLOWED: tuple[PoseCheck, ...] = (WellConstrained(), MatchesPrediction(), DepthColorConsistency())
+FOLLOWED: tuple[PoseCheck, ...] = (
+    WellConstrained(),
+    MatchesPrediction(),
+    DepthColorConsistency(),
+    UnlikeWhereFeaturesHaveIt(),
+)
 """Checks of a frame that was registered from where it was predicted."""
 
 PLAUSIBLE: tuple[PoseCheck, ...] = (

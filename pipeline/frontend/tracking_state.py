@@ -332,6 +332,16 @@ class TrackingState:
         """Median gray residual of the last frames that were followed; 0 before there is one."""
         return float(np.median(self.gray_rms)) if self.gray_rms else 0.0
 
+    def looks_worse_than_usual(self, candidate: PoseCandidate) -> bool:
+        """Whether a frame that was registered with its color looks unlike its keyframe by much more than others.
+
+        Args:
+            candidate: where it may be.
+        """
+        largest = self.config.tracking.failure.color_check_gray_of_usual * self.usual_gray_rms
+        used = candidate.without is Reason.NONE and bool(self.gray_rms)
+        return used and candidate.result.rms_gray > largest
+
     @property
     def largest_gray_rms(self) -> float:
         """Gray residual up to which a frame looks like its keyframe."""

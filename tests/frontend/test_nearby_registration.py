@@ -1,11 +1,16 @@
 """Registrations near the last pose: each is stated with the keyframe that it is to."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from duagc.pipeline import registration
 from duagc.pipeline.experiments.disturbances import Undisturbed
-from duagc.pipeline.frontend import nearby_registration
+from duagc.pipeline.frontend import nearby_registration, pose_checks
+from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
 from tests.frontend.conftest import START_OF_COMPARISONS as START
 
@@ -29,3 +34,70 @@ def test_wide_gates_are_of_the_latest_keyframe_whatever_features_find(
     assert wide.keyframe_index == state.keyframe_index
     T_map_camera = state.keyframe.T_map_keyframe @ wide.result.T_reference_target
     assert se3.distance(T_map_camera, run.poses[START])[0] < 2e-3
+
+
+def prepared(run: Undisturbed) -> tuple[TrackingState, CurrentFrame]:
+    tracker, shot = run.tracker(START), run.shots[START]
+    image = shot.color.astype(np.float32) / 255
+    frame = tracker.prepared(
+        RgbdImages(frame_index=shot.index, stamp_ns=shot.stamp_ns, image=image, depth_m=shot.depth)
+    )
+    return tracker.state, frame
+
+
+def off_by(offset_m: float, gray_of_usual: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame that is followed ends well in a wrong minimum, where it looks so much worse than usual."""
+
+    def register(reference, pyramid, T_guess, config, **options):
+        result = registration.register(reference, pyramid, T_guess, config, **options)
+        T = result.T_reference_target @ se3.exp(np.array([offset_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        return replace(result, T_reference_target=T, rms_gray=gray_of_usual * result.rms_gray)
+
+    monkeypatch.setattr(nearby_registration, "register", register)
+
+
+def distance_m(run: Undisturbed, state: TrackingState, found: PoseCandidate | Reason) -> float:
+    assert isinstance(found, PoseCandidate)
+    T_map_camera = state.keyframes[found.keyframe_index].T_map_keyframe @ found.result.T_reference_target
+    return float(se3.distance(T_map_camera, run.poses[START])[0])
+
+
+def test_a_frame_that_looks_worse_than_usual_is_where_features_make_it_look_as_usual(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, frame = prepared(run)
+    off_by(0.02, 2.0, monkeypatch)  # so little that features do not contradict
+    assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
+
+
+def test_without_such_a_place_it_stays_where_it_was_found(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, frame = prepared(run)
+    off_by(0.02, 2.0, monkeypatch)
+    monkeypatch.setattr(nearby_registration, "initial_motions", lambda state, frame: iter(()))
+    assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) == pytest.approx(
+        0.02, abs=2e-3
+    )
+
+
+def test_features_reject_a_frame_that_looks_worse_than_usual(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, frame = prepared(run)
+    off_by(0.1, 2.0, monkeypatch)
+    monkeypatch.setattr(nearby_registration, "_looking_as_usual", lambda state, frame, found: found)
+    assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
+
+
+def test_features_are_not_asked_of_a_frame_that_looks_as_usual(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, frame = prepared(run)
+
+    def unexpected(*_: object) -> None:
+        raise AssertionError("features were asked")
+
+    for module, name in ((nearby_registration, "initial_motions"), (pose_checks, "judge_motion")):
+        monkeypatch.setattr(module, name, unexpected)
+    assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
