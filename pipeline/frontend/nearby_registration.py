@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import product
+
+import numpy as np
 
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.feature_initialization import initial_motions
 from duagc.pipeline.frontend.pose_checks import (
     FOLLOWED,
     FOUND_BY_FEATURES,
+    FOUND_FROM_ALL_AROUND,
     FOUND_NEARBY,
     PLAUSIBLE,
     PoseCheck,
     verify,
 )
 from duagc.pipeline.frontend.stable_registration import register_until_stable
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
-from duagc.pipeline.registration import register
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, Prediction, TrackingState
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import Registration, register
 
 
 def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason:
@@ -89,6 +94,34 @@ def _attempts(
             state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
         )
         yield PoseCandidate(index, result), PLAUSIBLE if weak else FOUND_NEARBY
+    if weak:
+        yield from _from_all_around(state, frame, predicted)
+
+
+def _from_all_around(
+    state: TrackingState, frame: CurrentFrame, predicted: Prediction
+) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
+    """The registration that is reached from all around the prediction, as far as the camera may be from it.
+
+    Where views share few features, and the prediction is weak, a registration may end in a wrong minimum near its
+    start. One that all starts lead to is the only minimum there.
+    """
+    tracking, turn_rad = state.config.tracking, state.angle_of(predicted.sigma_px)
+    found: list[Registration] = []
+    for axis, sign in product((3, 4), (-1.0, 1.0)):
+        tangent = np.zeros(6)
+        tangent[axis] = sign * turn_rad
+        start = predicted.T_keyframe_camera @ se3.exp(tangent)
+        result = register_until_stable(
+            state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
+        )
+        if not result.ok:
+            return
+        found.append(result)
+    first = found[0].T_reference_target
+    distances = [se3.distance(first, other.T_reference_target) for other in found[1:]]
+    if all(m < tracking.stable_m and rad < tracking.stable_rad for m, rad in distances):
+        yield PoseCandidate(state.keyframe_index, found[0]), FOUND_FROM_ALL_AROUND
 
 
 def _from_features(

@@ -152,6 +152,15 @@ class LooksAlike:
         return candidate if candidate.result.rms_gray <= state.largest_gray_rms else Reason.OBSTRUCTED
 
 
+class LooksAsUsual:
+    """Gray values must fit the keyframe about as well as those of other frames do."""
+
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
+        return Reason.OBSTRUCTED if state.looks_worse_than_usual(candidate) else candidate
+
+
 class RespectsFreeSpace:
     """Little of the frame may be in space that the keyframe saw to be free."""
 
@@ -300,3 +309,11 @@ FOUND_BY_FEATURES: tuple[PoseCheck, ...] = (
 )
 """Checks of a pose that was found from matched features, whose descriptors say that it looks alike: far from its
 keyframe a frame overlaps little, and its gray values fit less well than from near."""
+
+FOUND_FROM_ALL_AROUND: tuple[PoseCheck, ...] = (
+    LooksAsUsual(),
+    RespectsFreeSpace(),
+    WithinReach(),
+    FeaturesDoNotContradict(),
+)
+"""Checks of a pose that registrations from all around the prediction lead to."""

@@ -253,12 +253,24 @@ class TrackingState:
 
     def _deviation_px(self, elapsed_s: float, *, turns: bool) -> float:
         """By how much acceleration moves a view off its prediction, pixels of the coarsest image of a registration."""
-        tracking, keyframe = self.config.tracking, self.keyframe
-        halvings = len(tracking.strides) - len(tracking.registration.iterations)
-        focal_px = keyframe.coarsest.camera.fx * 2.0**halvings
+        tracking = self.config.tracking
         turned = tracking.prior.angular_acceleration_rad_s2 if turns else 0.0
-        moved = tracking.prior.acceleration_m_s2 / keyframe.median_depth_m
-        return focal_px * (turned + moved) * 0.5 * elapsed_s**2
+        moved = tracking.prior.acceleration_m_s2 / self.keyframe.median_depth_m
+        return self._coarsest_focal_px * (turned + moved) * 0.5 * elapsed_s**2
+
+    def angle_of(self, deviation_px: float) -> float:
+        """Angle in radians of a distance in the coarsest image that a registration begins with.
+
+        Args:
+            deviation_px: the distance, pixels.
+        """
+        return deviation_px / self._coarsest_focal_px
+
+    @property
+    def _coarsest_focal_px(self) -> float:
+        tracking = self.config.tracking
+        halvings = len(tracking.strides) - len(tracking.registration.iterations)
+        return float(self.keyframe.coarsest.camera.fx * 2.0**halvings)
 
     def depth_motion(self, stamp_ns: int, depth_offset_ns: int) -> Array | None:
         """T_color_depth [4, 4], how the camera moves from the time of color to that of depth; None if unknown.

@@ -1,6 +1,7 @@
 """Registrations near the last pose: each is stated with the keyframe that it is to."""
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import Outcome
 from tests.frontend.conftest import START_OF_COMPARISONS as START
 
 
@@ -101,3 +103,45 @@ def test_features_are_not_asked_of_a_frame_that_looks_as_usual(
     for module, name in ((nearby_registration, "initial_motions"), (pose_checks, "judge_motion")):
         monkeypatch.setattr(module, name, unexpected)
     assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
+
+
+def all_around(state: TrackingState, frame: CurrentFrame, sigma_px: float) -> list[PoseCandidate]:
+    predicted = replace(state.predict(frame.stamp_ns), sigma_px=sigma_px)
+    return [found for found, _ in nearby_registration._from_all_around(state, frame, predicted)]
+
+
+def test_what_all_starts_around_a_weak_prediction_lead_to_is_a_place(run: Undisturbed) -> None:
+    state, frame = prepared(run)
+    (found,) = all_around(state, frame, 3.0)
+    assert distance_m(run, state, found) < 2e-3
+
+
+@pytest.mark.parametrize("end", [Outcome.OK, Outcome.RESIDUAL])
+def test_where_one_of_them_leads_elsewhere_or_nowhere_there_is_none(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch, end: Outcome
+) -> None:
+    state, frame = prepared(run)
+    true_register, calls = nearby_registration.register_until_stable, count()
+
+    def register(*arguments, **options):
+        result = true_register(*arguments, **options)
+        if next(calls) != 2:
+            return result
+        T = result.T_reference_target @ se3.exp(np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        return replace(result, T_reference_target=T, outcome=end)
+
+    monkeypatch.setattr(nearby_registration, "register_until_stable", register)
+    assert not all_around(state, frame, 3.0)
+
+
+def test_a_camera_with_a_weak_prediction_and_few_features_is_followed_from_all_around(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, frame = prepared(run)
+    predicted = replace(state.predict(frame.stamp_ns), sigma_px=5.0)
+    monkeypatch.setattr(state, "predict", lambda stamp_ns: predicted)
+    monkeypatch.setattr(nearby_registration, "initial_motions", lambda state, frame: iter(()))
+    monkeypatch.setattr(pose_checks, "features_agree", lambda *_: False)
+    assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
+    monkeypatch.setattr(nearby_registration, "_from_all_around", lambda *_: iter(()))
+    assert nearby_registration.register_nearby(state, frame) is Reason.OBSTRUCTED
