@@ -41,8 +41,11 @@ def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate 
 
 
 def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> PoseCandidate:
-    """What was found, or where features have the frame, if it looks as usual there and does not where it was found."""
-    if not state.looks_worse_than_usual(found):
+    """What was found, or where features have the frame, if it looks as usual there.
+
+    They are asked where it looks worse than usual, or color and depth contradict each other.
+    """
+    if found.without is Reason.NONE and not state.looks_worse_than_usual(found):
         return found
     tracking = state.config.tracking
     for index, guess in initial_motions(state, frame):

@@ -145,3 +145,29 @@ def test_a_camera_with_a_weak_prediction_and_few_features_is_followed_from_all_a
     assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
     monkeypatch.setattr(nearby_registration, "_from_all_around", lambda *_: iter(()))
     assert nearby_registration.register_nearby(state, frame) is Reason.OBSTRUCTED
+
+
+def test_color_alone_gives_way_to_where_features_make_a_frame_look_as_usual(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class ByColor:
+        """Color and depth contradict each other, and color alone is 3 cm off."""
+
+        def judge(
+            self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+        ) -> PoseCandidate | Reason:
+            off = se3.exp(np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
+            result = candidate.result
+            moved = replace(result, T_reference_target=result.T_reference_target @ off)
+            return replace(candidate, result=moved, without=Reason.CONTRADICTION)
+
+    state, frame = prepared(run)
+    monkeypatch.setattr(nearby_registration, "FOLLOWED", (ByColor(),))
+    found = nearby_registration.register_nearby(state, frame)
+    assert distance_m(run, state, found) < 2e-3
+    assert isinstance(found, PoseCandidate)
+    assert found.without is Reason.NONE
+    monkeypatch.setattr(nearby_registration, "initial_motions", lambda state, frame: iter(()))
+    found = nearby_registration.register_nearby(state, frame)
+    assert isinstance(found, PoseCandidate)
+    assert found.without is Reason.CONTRADICTION
