@@ -129,7 +129,8 @@ class FailureConfig(Config):
     sigma_of_translation_without_depth: float = 0.07
     """Standard deviation of that error per axis, as a share of the distance; part of the information."""
     color_check_gray_of_usual: float = 1.75
-    """A frame whose gray residual is larger than this many times the usual one is also registered by color alone."""
+    """A frame whose gray residual is larger than this many times the usual one is also registered by color alone, and
+    from features."""
     max_depth_color_m: float = 0.01
     """Largest distance between that pose and the one by depth and color."""
     max_depth_color_of_translation: float = 0.5

@@ -13,7 +13,8 @@ import numpy as np
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, TrackingState
+from duagc.pipeline.frontend.current_frame import CurrentFrame
+from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.registration.features import matches
 from duagc.pipeline.registration.geometric_verification import motion_from_features
 

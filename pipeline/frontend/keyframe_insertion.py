@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from duagc.pipeline.base.shelf import SHELF
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
+from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Reference, register

@@ -13,11 +13,12 @@ import numpy as np
 
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
 from duagc.pipeline.frontend.submaps import TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking import Tracker
-from duagc.pipeline.frontend.tracking_state import RECENT_FRAMES, CurrentFrame, PoseCandidate
+from duagc.pipeline.frontend.tracking_state import RECENT_FRAMES
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import RgbdFrame, RgbdLog

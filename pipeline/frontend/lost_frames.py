@@ -17,11 +17,11 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.bundle import Images
+from duagc.pipeline.frontend.current_frame import features_of
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
 from duagc.pipeline.frontend.judgment import contradicts
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from duagc.pipeline.frontend.tracking_state import features_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.align import reach_factor

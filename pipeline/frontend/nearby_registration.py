@@ -7,6 +7,8 @@ from itertools import product
 
 import numpy as np
 
+from duagc.pipeline.config.frontend import TrackingConfig
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.feature_initialization import initial_motions
 from duagc.pipeline.frontend.pose_checks import (
@@ -19,7 +21,7 @@ from duagc.pipeline.frontend.pose_checks import (
     verify,
 )
 from duagc.pipeline.frontend.stable_registration import register_until_stable
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, Prediction, TrackingState
+from duagc.pipeline.frontend.tracking_state import Prediction, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, register
 
@@ -41,21 +43,21 @@ def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate 
 
 
 def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> PoseCandidate:
-    """What was found, or where features have the frame, if it looks as usual there.
-
-    They are asked where it looks worse than usual, or color and depth contradict each other.
-    """
-    if found.without is Reason.NONE and not state.looks_worse_than_usual(found):
+    """What was found, or where features have the frame, if only there it looks as usual by color and depth."""
+    if _looks_as_usual(state, found):
         return found
-    tracking = state.config.tracking
-    for index, guess in initial_motions(state, frame):
-        result = register_until_stable(
-            state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
-        )
-        other = verify(FOUND_NEARBY, state, frame, PoseCandidate(index, result))
-        if isinstance(other, PoseCandidate) and not state.looks_worse_than_usual(other):
+    for candidate in _from_features(state, frame, state.config.tracking):
+        other = verify(FOUND_NEARBY, state, frame, candidate)
+        if isinstance(other, PoseCandidate) and (
+            other.without is not Reason.NONE or _looks_as_usual(state, other)
+        ):
             return other
     return found
+
+
+def _looks_as_usual(state: TrackingState, candidate: PoseCandidate) -> bool:
+    """Whether color and depth were used, and gray values fit no worse than usual."""
+    return candidate.without is Reason.NONE and not state.looks_worse_than_usual(candidate.result)
 
 
 def _attempts(
@@ -74,7 +76,8 @@ def _attempts(
     if predicted.T_keyframe_camera is not last:
         starts.append(last)
     if weak:
-        yield from _from_features(state, frame)
+        for candidate in _from_features(state, frame, tracking.verified_by_features()):
+            yield candidate, FOUND_BY_FEATURES
     if not state.lost:
         for start in starts:
             information = predicted.information if start is predicted.T_keyframe_camera else None
@@ -87,31 +90,28 @@ def _attempts(
             )
             yield PoseCandidate(index, result), PLAUSIBLE if weak else FOLLOWED
     if not weak:
-        for other, guess in initial_motions(state, frame):
-            result = register_until_stable(
-                state.keyframes[other], frame.pyramid, guess, tracking, first=tracking.registration
-            )
-            yield PoseCandidate(other, result), FOUND_NEARBY
+        for candidate in _from_features(state, frame, tracking):
+            yield candidate, FOUND_NEARBY
     for start in starts:
         result = register_until_stable(
             state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
         )
         yield PoseCandidate(index, result), PLAUSIBLE if weak else FOUND_NEARBY
-    if weak:
-        yield from _from_all_around(state, frame, predicted)
+    if weak and (agreed := _from_all_around(state, frame, predicted)) is not None:
+        yield agreed, FOUND_FROM_ALL_AROUND
 
 
 def _from_all_around(
     state: TrackingState, frame: CurrentFrame, predicted: Prediction
-) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
+) -> PoseCandidate | None:
     """The registration that is reached from all around the prediction, as far as the camera may be from it.
 
     Where views share few features, and the prediction is weak, a registration may end in a wrong minimum near its
-    start. One that all starts lead to is the only minimum there.
+    start. One that all starts lead to is the only minimum there. None: they do not.
     """
-    tracking, turn_rad = state.config.tracking, state.angle_of(predicted.sigma_px)
+    tracking, turn_rad = state.config.tracking, state.deviation_rad(predicted.sigma_px)
     found: list[Registration] = []
-    for axis, sign in product((3, 4), (-1.0, 1.0)):
+    for axis, sign in product((3, 4), (-1.0, 1.0)):  # up, down, left and right
         tangent = np.zeros(6)
         tangent[axis] = sign * turn_rad
         start = predicted.T_keyframe_camera @ se3.exp(tangent)
@@ -119,21 +119,20 @@ def _from_all_around(
             state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
         )
         if not result.ok:
-            return
+            return None
         found.append(result)
     first = found[0].T_reference_target
     distances = [se3.distance(first, other.T_reference_target) for other in found[1:]]
-    if all(m < tracking.stable_m and rad < tracking.stable_rad for m, rad in distances):
-        yield PoseCandidate(state.keyframe_index, found[0]), FOUND_FROM_ALL_AROUND
+    agree = all(m < tracking.stable_m and rad < tracking.stable_rad for m, rad in distances)
+    return PoseCandidate(state.keyframe_index, found[0]) if agree else None
 
 
 def _from_features(
-    state: TrackingState, frame: CurrentFrame
-) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
-    """Registrations from the motion that features agree on, each with its checks."""
-    tracking = state.config.tracking.verified_by_features()
+    state: TrackingState, frame: CurrentFrame, tracking: TrackingConfig
+) -> Iterator[PoseCandidate]:
+    """Registrations by some settings from the motions that features agree on."""
     for index, guess in initial_motions(state, frame):
         result = register_until_stable(
             state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
         )
-        yield PoseCandidate(index, result), FOUND_BY_FEATURES
+        yield PoseCandidate(index, result)

@@ -20,12 +20,12 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.other_trackers import StatedInformationConfig
+from duagc.pipeline.frontend.current_frame import features_of
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.keyframe_graph import leaves_keyframe, predicted_overlap
 from duagc.pipeline.frontend.submaps import TrackedLog, TrackedSubmap
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from duagc.pipeline.frontend.tracking_state import features_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory

@@ -14,10 +14,11 @@ import numpy as np
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
 from duagc.pipeline.frontend.judgment import contradicts
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
+from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.features import matches
@@ -110,11 +111,10 @@ class DepthColorConsistency:
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
         limits = state.config.tracking.failure
-        largest = limits.color_check_gray_of_usual * state.usual_gray_rms
-        if state.last_good is None or not state.gray_rms or candidate.result.rms_gray <= largest:
+        if state.last_good is None or not state.looks_worse_than_usual(candidate.result):
             return candidate
         color_only = state.register_color(frame)
-        if not color_only.ok or color_only.rms_gray > largest:
+        if not color_only.ok or state.looks_worse_than_usual(color_only):
             return Reason.CONTRADICTION if state.depth_color_inconsistent else candidate
         T, T_color_only = candidate.result.T_reference_target, color_only.T_reference_target
         agree = state.last_good.agrees(T, T_color_only, limits, state.depth_color_inconsistent)
@@ -152,13 +152,13 @@ class LooksAlike:
         return candidate if candidate.result.rms_gray <= state.largest_gray_rms else Reason.OBSTRUCTED
 
 
-class LooksAsUsual:
+class LooksNoWorseThanUsual:
     """Gray values must fit the keyframe about as well as those of other frames do."""
 
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
-        return Reason.OBSTRUCTED if state.looks_worse_than_usual(candidate) else candidate
+        return Reason.OBSTRUCTED if state.looks_worse_than_usual(candidate.result) else candidate
 
 
 class RespectsFreeSpace:
@@ -227,8 +227,8 @@ class FeaturesDoNotContradict:
         return Reason.OBSTRUCTED if found is not None and contradicts(found, limits) else candidate
 
 
-class UnlikeWhereFeaturesHaveIt:
-    """A frame that looks worse than usual must be where features have it, if they agree on a motion at all.
+class FeaturesAllowWorseLook:
+    """A frame that looks worse than usual, by color and depth, must not be elsewhere than where features have it.
 
     Dense registration ends in a wrong minimum where the camera moved other than predicted by more than it reaches: a
     view along a wall, which only its pictures tell from the next one, was taken to be 6 cm off.
@@ -237,7 +237,7 @@ class UnlikeWhereFeaturesHaveIt:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
-        if not state.looks_worse_than_usual(candidate):
+        if candidate.without is not Reason.NONE or not state.looks_worse_than_usual(candidate.result):
             return candidate
         return FeaturesDoNotContradict().judge(state, frame, candidate)
 
@@ -285,7 +285,7 @@ FOLLOWED: tuple[PoseCheck, ...] = (
     WellConstrained(),
     MatchesPrediction(),
     DepthColorConsistency(),
-    UnlikeWhereFeaturesHaveIt(),
+    FeaturesAllowWorseLook(),
 )
 """Checks of a frame that was registered from where it was predicted."""
 
@@ -311,7 +311,7 @@ FOUND_BY_FEATURES: tuple[PoseCheck, ...] = (
 keyframe a frame overlaps little, and its gray values fit less well than from near."""
 
 FOUND_FROM_ALL_AROUND: tuple[PoseCheck, ...] = (
-    LooksAsUsual(),
+    LooksNoWorseThanUsual(),
     RespectsFreeSpace(),
     WithinReach(),
     FeaturesDoNotContradict(),

@@ -32,6 +32,11 @@ class RejectedPart:
     T_map_keyframe: Array
     pairs: Sequence[RelativePose]
 
+    @property
+    def index_of(self) -> dict[int, int]:
+        """Its own numbers of its keyframes, by those in the path."""
+        return {before: k for k, before in enumerate(self.keyframes)}
+
     def submap(self, number: int, keyframes: Sequence[TrackedKeyframe]) -> TrackedSubmap:
         """The part as a submap.
 
@@ -39,7 +44,7 @@ class RejectedPart:
             number: of the submap.
             keyframes: of the path.
         """
-        new = {before: k for k, before in enumerate(self.keyframes)}
+        new = self.index_of
         own = [
             replace(
                 keyframes[before],
@@ -95,7 +100,7 @@ def separated(
     frames, submap_of, submaps = list(log.frames), list(log.submap_of), list(log.submaps)
     index_of, others = dict(component.index_of), []
     for part in parts if config.enabled else ():
-        new = {before: k for k, before in enumerate(part.keyframes)}
+        new = part.index_of
         anchored = {
             at: new[index_of[anchor]]
             for at, frame in enumerate(frames)

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import RelocalizationConfig
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.pose_checks import PLAUSIBLE, verify
 from duagc.pipeline.frontend.stable_registration import register_until_stable
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
+from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.features import Features, matches

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.frontend.current_frame import CurrentFrame
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking import Tracker
-from duagc.pipeline.frontend.tracking_state import CurrentFrame
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.posegraph.relative_poses import RelativePose

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason, saturated_share
 from duagc.pipeline.frontend.frame_images import Image, RgbdImages
 from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
@@ -26,7 +27,7 @@ from duagc.pipeline.frontend.missing_images import follow_by_color, follow_by_de
 from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
+from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import RelativePose

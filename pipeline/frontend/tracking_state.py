@@ -5,18 +5,17 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.config.frontend import FrontendConfig, RelocalizationConfig
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import (
     FrameIntervals,
     FrozenImageDetector,
     OcclusionDetector,
-    Reason,
     Viewpoint,
 )
 from duagc.pipeline.frontend.gyro_calibration import FEWEST, MOST, GyroCorrection, Turn
@@ -24,63 +23,11 @@ from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Motion, MotionPrior
-from duagc.pipeline.registration import Registration, RgbdPyramid
-from duagc.pipeline.registration.features import Features, extract_from_pyramid
+from duagc.pipeline.registration import Registration
 
 EXTRAPOLATED_INTERVALS = 1.5
 """Usual intervals between frames over which a velocity predicts in any case."""
 RECENT_FRAMES = 7  # whose mean velocity moves depth of another time
-
-
-@dataclass(frozen=True)
-class CurrentFrame:
-    """The frame that is being tracked.
-
-    Attributes:
-        frame_index: in the log.
-        stamp_ns: its time.
-        pyramid: its images.
-        relocalization: how its features are extracted.
-        depth_offset_ns: how much later its depth was taken, wherever that was moved to.
-    """
-
-    frame_index: int
-    stamp_ns: int
-    pyramid: RgbdPyramid
-    relocalization: RelocalizationConfig
-    depth_offset_ns: int = 0
-
-    @cached_property
-    def features(self) -> Features:
-        """Its features; computed when first needed."""
-        return features_of(self.pyramid, self.relocalization)
-
-
-def features_of(pyramid: RgbdPyramid, config: RelocalizationConfig) -> Features:
-    """The features by which a frame is relocalized, and to which it is compared as a keyframe.
-
-    Args:
-        pyramid: images of the frame.
-        config: number of features and size of the image.
-    """
-    return extract_from_pyramid(pyramid, config.max_width_px, config.features)
-
-
-@dataclass(frozen=True)
-class PoseCandidate:
-    """A registration of the current frame to a keyframe that is not accepted yet.
-
-    Attributes:
-        keyframe_index: the keyframe.
-        result: the registration.
-        without: why only its color, or only its depth, was used.
-        unlike: whether it looked unlike the keyframe, and color alone confirmed it.
-    """
-
-    keyframe_index: int
-    result: Registration
-    without: Reason = Reason.NONE
-    unlike: bool = False
 
 
 @dataclass(frozen=True)
@@ -258,8 +205,8 @@ class TrackingState:
         moved = tracking.prior.acceleration_m_s2 / self.keyframe.median_depth_m
         return self._coarsest_focal_px * (turned + moved) * 0.5 * elapsed_s**2
 
-    def angle_of(self, deviation_px: float) -> float:
-        """Angle in radians of a distance in the coarsest image that a registration begins with.
+    def deviation_rad(self, deviation_px: float) -> float:
+        """The angle, radians, of a distance in the coarsest image that a registration begins with.
 
         Args:
             deviation_px: the distance, pixels.
@@ -268,6 +215,7 @@ class TrackingState:
 
     @property
     def _coarsest_focal_px(self) -> float:
+        """Focal length of the coarsest image that a registration begins with."""
         tracking = self.config.tracking
         halvings = len(tracking.strides) - len(tracking.registration.iterations)
         return float(self.keyframe.coarsest.camera.fx * 2.0**halvings)
@@ -344,15 +292,14 @@ class TrackingState:
         """Median gray residual of the last frames that were followed; 0 before there is one."""
         return float(np.median(self.gray_rms)) if self.gray_rms else 0.0
 
-    def looks_worse_than_usual(self, candidate: PoseCandidate) -> bool:
-        """Whether a frame that was registered with its color looks unlike its keyframe by much more than others.
+    def looks_worse_than_usual(self, result: Registration) -> bool:
+        """Whether gray values fit much less well than those of other frames; False before there are others.
 
         Args:
-            candidate: where it may be.
+            result: of a registration with color.
         """
         largest = self.config.tracking.failure.color_check_gray_of_usual * self.usual_gray_rms
-        used = candidate.without is Reason.NONE and bool(self.gray_rms)
-        return used and candidate.result.rms_gray > largest
+        return bool(self.gray_rms) and result.rms_gray > largest
 
     @property
     def largest_gray_rms(self) -> float:

@@ -10,9 +10,9 @@ import pytest
 from duagc.pipeline.config.frontend import KeyframeConfig, LoopConfig, RelocalizationConfig
 from duagc.pipeline.frontend import bundle, loops
 from duagc.pipeline.frontend.bundle import Neighborhood, optimize
+from duagc.pipeline.frontend.current_frame import features_of
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pose_graph
 from duagc.pipeline.frontend.loops import find_loops
-from duagc.pipeline.frontend.tracking_state import features_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import RelativePose

@@ -10,11 +10,11 @@ import pytest
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments import disturbances as d
 from duagc.pipeline.experiments.disturbances import Shot, Undisturbed
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.relocalization import Relocalizer, by_latest_keyframe
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid, register
 from tests.fixtures.films import CAMERA, filmed

@@ -9,33 +9,13 @@ import pytest
 from duagc.pipeline import registration
 from duagc.pipeline.experiments.disturbances import Undisturbed
 from duagc.pipeline.frontend import nearby_registration, pose_checks
+from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
-from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
+from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Outcome
 from tests.frontend.conftest import START_OF_COMPARISONS as START
-
-
-def test_wide_gates_are_of_the_latest_keyframe_whatever_features_find(
-    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tracker, shot = run.tracker(START), run.shots[START]
-    image = shot.color.astype(np.float32) / 255
-    frame = tracker.prepared(
-        RgbdImages(frame_index=shot.index, stamp_ns=shot.stamp_ns, image=image, depth_m=shot.depth)
-    )
-    state = tracker.state
-    T_first_latest = se3.inverse(state.keyframes[0].T_map_keyframe) @ state.keyframe.T_map_keyframe
-    elsewhere = [(0, T_first_latest @ state.T_keyframe_camera)]
-    monkeypatch.setattr(nearby_registration, "initial_motions", lambda state, frame: iter(elsewhere))
-    found = [candidate for candidate, _ in nearby_registration._attempts(state, frame)]
-    assert state.keyframe_index > 0
-    *_, by_features, _, wide = found
-    assert by_features.keyframe_index == 0
-    assert wide.keyframe_index == state.keyframe_index
-    T_map_camera = state.keyframe.T_map_keyframe @ wide.result.T_reference_target
-    assert se3.distance(T_map_camera, run.poses[START])[0] < 2e-3
 
 
 def prepared(run: Undisturbed) -> tuple[TrackingState, CurrentFrame]:
@@ -45,6 +25,21 @@ def prepared(run: Undisturbed) -> tuple[TrackingState, CurrentFrame]:
         RgbdImages(frame_index=shot.index, stamp_ns=shot.stamp_ns, image=image, depth_m=shot.depth)
     )
     return tracker.state, frame
+
+
+def test_wide_gates_are_of_the_latest_keyframe_whatever_features_find(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, frame = prepared(run)
+    T_first_latest = se3.inverse(state.keyframes[0].T_map_keyframe) @ state.keyframe.T_map_keyframe
+    elsewhere = [(0, T_first_latest @ state.T_keyframe_camera)]
+    monkeypatch.setattr(nearby_registration, "initial_motions", lambda state, frame: iter(elsewhere))
+    found = [candidate for candidate, _ in nearby_registration._attempts(state, frame)]
+    assert state.keyframe_index > 0
+    *_, by_features, _, wide = found
+    assert by_features.keyframe_index == 0
+    assert wide.keyframe_index == state.keyframe_index
+    assert distance_m(run, state, wide) < 2e-3
 
 
 def off_by(offset_m: float, gray_of_usual: float, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,7 +53,7 @@ def off_by(offset_m: float, gray_of_usual: float, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(nearby_registration, "register", register)
 
 
-def distance_m(run: Undisturbed, state: TrackingState, found: PoseCandidate | Reason) -> float:
+def distance_m(run: Undisturbed, state: TrackingState, found: PoseCandidate | Reason | None) -> float:
     assert isinstance(found, PoseCandidate)
     T_map_camera = state.keyframes[found.keyframe_index].T_map_keyframe @ found.result.T_reference_target
     return float(se3.distance(T_map_camera, run.poses[START])[0])
@@ -105,15 +100,14 @@ def test_features_are_not_asked_of_a_frame_that_looks_as_usual(
     assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
 
 
-def all_around(state: TrackingState, frame: CurrentFrame, sigma_px: float) -> list[PoseCandidate]:
+def all_around(state: TrackingState, frame: CurrentFrame, sigma_px: float) -> PoseCandidate | None:
     predicted = replace(state.predict(frame.stamp_ns), sigma_px=sigma_px)
-    return [found for found, _ in nearby_registration._from_all_around(state, frame, predicted)]
+    return nearby_registration._from_all_around(state, frame, predicted)
 
 
 def test_what_all_starts_around_a_weak_prediction_lead_to_is_a_place(run: Undisturbed) -> None:
     state, frame = prepared(run)
-    (found,) = all_around(state, frame, 3.0)
-    assert distance_m(run, state, found) < 2e-3
+    assert distance_m(run, state, all_around(state, frame, 3.0)) < 2e-3
 
 
 @pytest.mark.parametrize("end", [Outcome.OK, Outcome.RESIDUAL])
@@ -131,7 +125,7 @@ def test_where_one_of_them_leads_elsewhere_or_nowhere_there_is_none(
         return replace(result, T_reference_target=T, outcome=end)
 
     monkeypatch.setattr(nearby_registration, "register_until_stable", register)
-    assert not all_around(state, frame, 3.0)
+    assert all_around(state, frame, 3.0) is None
 
 
 def test_a_camera_with_a_weak_prediction_and_few_features_is_followed_from_all_around(
@@ -143,7 +137,7 @@ def test_a_camera_with_a_weak_prediction_and_few_features_is_followed_from_all_a
     monkeypatch.setattr(nearby_registration, "initial_motions", lambda state, frame: iter(()))
     monkeypatch.setattr(pose_checks, "features_agree", lambda *_: False)
     assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
-    monkeypatch.setattr(nearby_registration, "_from_all_around", lambda *_: iter(()))
+    monkeypatch.setattr(nearby_registration, "_from_all_around", lambda *_: None)
     assert nearby_registration.register_nearby(state, frame) is Reason.OBSTRUCTED
 
 

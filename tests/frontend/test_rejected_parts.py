@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.frontend import FrontendConfig, SubmapConfig, TrackingConfig
+from duagc.pipeline.config.frontend import SubmapConfig
 from duagc.pipeline.frontend import stage
 from duagc.pipeline.frontend.components import Component, whole
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.rejected_parts import RejectedPart, separated
 from duagc.pipeline.frontend.stage import component_path, run_frontend
-from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
+from duagc.pipeline.frontend.submaps import TrackedLog
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
@@ -23,10 +22,10 @@ from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.registration.features import Features
 from duagc.schemas import topics
-from tests.fixtures.films import SMALL, walk_around
-from tests.frontend.test_submaps import write
+from tests.fixtures.films import walk_around
+from tests.frontend.test_submaps import CONFIG, write
+from tests.frontend.test_submaps import tracked as tracked_in_submaps
 
-CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)), mapping_enabled=False)
 FRAMES = 48
 NO_FEATURES = Features(np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
 AHEAD = se3.exp(np.array([0.0, 0.0, 1.2, 0.0, 0.0, 0.0]))
@@ -39,11 +38,7 @@ def walk():
 
 @pytest.fixture(scope="module")
 def tracked(walk) -> TrackedLog:
-    tracker = SubmapTracker(SMALL, CONFIG)
-    for s in walk[0][:FRAMES]:
-        image = s.color.astype(np.float32) / 255
-        tracker.track(RgbdImages(frame_index=s.index, stamp_ns=s.stamp_ns, image=image, depth_m=s.depth))
-    return tracker.finish()
+    return tracked_in_submaps(walk[0][:FRAMES])
 
 
 @pytest.fixture(scope="module")
