@@ -48,9 +48,7 @@ def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCand
         return found
     for candidate in _from_features(state, frame, state.config.tracking):
         other = verify(FOUND_NEARBY, state, frame, candidate)
-        if isinstance(other, PoseCandidate) and (
-            other.without is not Reason.NONE or _looks_as_usual(state, other)
-        ):
+        if isinstance(other, PoseCandidate) and _looks_as_usual(state, other):
             return other
     return found
 

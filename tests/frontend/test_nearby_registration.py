@@ -165,3 +165,23 @@ def test_color_alone_gives_way_to_where_features_make_a_frame_look_as_usual(
     found = nearby_registration.register_nearby(state, frame)
     assert isinstance(found, PoseCandidate)
     assert found.without is Reason.CONTRADICTION
+
+
+def test_color_alone_does_not_take_the_place_of_color_and_depth(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame that looks worse than usual; from features depth contradicts color."""
+
+    class ByColor:
+        def judge(
+            self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+        ) -> PoseCandidate | Reason:
+            return replace(candidate, without=Reason.CONTRADICTION)
+
+    state, frame = prepared(run)
+    off_by(0.02, 2.0, monkeypatch)
+    monkeypatch.setattr(nearby_registration, "FOUND_NEARBY", (ByColor(),))
+    found = nearby_registration.register_nearby(state, frame)
+    assert isinstance(found, PoseCandidate)
+    assert found.without is Reason.NONE
+    assert distance_m(run, state, found) == pytest.approx(0.02, abs=2e-3)
