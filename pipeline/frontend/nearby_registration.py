@@ -69,7 +69,7 @@ def _attempts(
     """
     tracking, index = state.config.tracking, state.keyframe_index
     last, predicted = state.T_keyframe_camera, state.predict(frame.stamp_ns)
-    weak = predicted.sigma_px > tracking.prior.max_deviation_px and not state.lost
+    weak = state.weakly_predicted(predicted)
     starts = [predicted.T_keyframe_camera]
     if predicted.T_keyframe_camera is not last:
         starts.append(last)

@@ -118,8 +118,7 @@ class DepthColorConsistency:
             return Reason.CONTRADICTION if state.depth_color_inconsistent else candidate
         T, T_color_only = candidate.result.T_reference_target, color_only.T_reference_target
         agree = state.last_good.agrees(T, T_color_only, limits, state.depth_color_inconsistent)
-        predicted = state.predict(frame.stamp_ns)
-        weak = predicted.sigma_px > state.config.tracking.prior.max_deviation_px and not state.lost
+        weak = state.weakly_predicted(state.predict(frame.stamp_ns))
         keyframe = state.keyframes[candidate.keyframe_index]
         if agree or (weak and _features_prefer(T, T_color_only, keyframe, frame)):
             return replace(candidate, unlike=True)

@@ -205,6 +205,14 @@ class TrackingState:
         moved = tracking.prior.acceleration_m_s2 / self.keyframe.median_depth_m
         return self._coarsest_focal_px * (turned + moved) * 0.5 * elapsed_s**2
 
+    def weakly_predicted(self, predicted: Prediction) -> bool:
+        """Whether a camera that is not lost may be farther from the prediction than a registration reaches.
+
+        Args:
+            predicted: of the frame.
+        """
+        return predicted.sigma_px > self.config.tracking.prior.max_deviation_px and not self.lost
+
     def deviation_rad(self, deviation_px: float) -> float:
         """The angle, radians, of a distance in the coarsest image that a registration begins with.
 
