@@ -141,22 +141,25 @@ def test_a_camera_with_a_weak_prediction_and_few_features_is_followed_from_all_a
     assert nearby_registration.register_nearby(state, frame) is Reason.OBSTRUCTED
 
 
+class ByColor:
+    """A check that leaves color alone, which is off by a shift to the right."""
+
+    def __init__(self, shift_m: float = 0.0) -> None:
+        self.T_camera_color = se3.exp(np.array([shift_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
+        result = candidate.result
+        moved = replace(result, T_reference_target=result.T_reference_target @ self.T_camera_color)
+        return replace(candidate, result=moved, without=Reason.CONTRADICTION)
+
+
 def test_color_alone_gives_way_to_where_features_make_a_frame_look_as_usual(
     run: Undisturbed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class ByColor:
-        """Color and depth contradict each other, and color alone is 3 cm off."""
-
-        def judge(
-            self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
-        ) -> PoseCandidate | Reason:
-            off = se3.exp(np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
-            result = candidate.result
-            moved = replace(result, T_reference_target=result.T_reference_target @ off)
-            return replace(candidate, result=moved, without=Reason.CONTRADICTION)
-
     state, frame = prepared(run)
-    monkeypatch.setattr(nearby_registration, "FOLLOWED", (ByColor(),))
+    monkeypatch.setattr(nearby_registration, "FOLLOWED", (ByColor(0.03),))
     found = nearby_registration.register_nearby(state, frame)
     assert distance_m(run, state, found) < 2e-3
     assert isinstance(found, PoseCandidate)
@@ -171,13 +174,6 @@ def test_color_alone_does_not_take_the_place_of_color_and_depth(
     run: Undisturbed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A frame that looks worse than usual; from features depth contradicts color."""
-
-    class ByColor:
-        def judge(
-            self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
-        ) -> PoseCandidate | Reason:
-            return replace(candidate, without=Reason.CONTRADICTION)
-
     state, frame = prepared(run)
     off_by(0.02, 2.0, monkeypatch)
     monkeypatch.setattr(nearby_registration, "FOUND_NEARBY", (ByColor(),))
