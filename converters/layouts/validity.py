@@ -27,7 +27,7 @@ BRIGHT_PERCENT = 75
 LEAST_IMAGES = 8  # that must tell
 LEAST_BLACK = 0.002  # of the pixels, in pieces that touch the border
 GROW_PX = 4  # a vignette does not end from one pixel to the next
-ROUNDING_PX = 1e-4  # of maps that are float32; changes a gray value by less than 0.03
+ROUNDING_STEPS = 2  # of float32 at the far border, by which maps may be off
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -41,9 +41,12 @@ def of_maps(maps: Maps, width: int, height: int) -> Mask:
         width: of the source, pixels.
         height: of the source, pixels.
     """
-    u, v = (part.astype(np.float64) for part in maps)
-    inside = (u >= -ROUNDING_PX) & (u <= width - 1 + ROUNDING_PX)
-    return np.asarray(inside & (v >= -ROUNDING_PX) & (v <= height - 1 + ROUNDING_PX))
+    inside = np.ones(maps[0].shape, dtype=bool)
+    for part, side in zip(maps, (width, height), strict=True):
+        at, last = part.astype(np.float64), side - 1
+        rounding_px = ROUNDING_STEPS * float(np.spacing(np.float32(last)))
+        inside &= (at >= -rounding_px) & (at <= last + rounding_px)
+    return inside
 
 
 def shrunk(mask: Mask, factor: int) -> Mask:

@@ -27,10 +27,10 @@ CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 
 @given(st.integers(0, 1000), st.floats(-0.4, 0.4))
-@example(225, 0.11624502557856675)  # a valid pixel is beyond the border by rounding
+@example(225, 0.11624502557856675)  # pixels lie 7e-5 px beyond the border
 @settings(deadline=None, max_examples=40)
 def test_a_valid_pixel_does_not_depend_on_what_is_beyond_the_border(seed: int, k1: float) -> None:
-    """By the interpolation itself: two borders give one value, or neighboring ones beyond the border by rounding."""
+    """Exact by the interpolation itself: with two borders it gives one value."""
     rays = CAMERA.rays().reshape(-1, 3)
     pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), CAMERA.matrix(), np.array([k1, 0, 0, 0]))
     u, v = pixels.reshape(48, 64, 2).astype(np.float32).transpose(2, 0, 1)
@@ -38,10 +38,7 @@ def test_a_valid_pixel_does_not_depend_on_what_is_beyond_the_border(seed: int, k
     image = np.random.default_rng(seed).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     black, white = (cv2.remap(image, *maps, cv2.INTER_LINEAR, borderValue=(c, c, c)) for c in (0, 255))
     valid = validity.of_maps(maps, 64, 48)
-    inside = (u >= 0) & (u <= 63) & (v >= 0) & (v <= 47)
-    assert not np.count_nonzero(inside & ~valid)
-    assert np.array_equal(black[inside], white[inside])
-    assert np.abs(black[valid].astype(int) - white[valid]).max() <= 1
+    assert np.abs(black[valid].astype(int) - white[valid]).max() <= (1 if abs(k1) < 1e-4 else 0)
     # and hardly a pixel is left out that does not depend on it, because its share is less than one gray value
     if abs(k1) > 0.01:
         assert np.count_nonzero(~valid & (black == white).all(axis=2)) <= 0.01 * valid.size
