@@ -41,7 +41,13 @@ def fit(points_a: Array, points_b: Array) -> Array:
 
 
 def ransac(
-    points_a: Array, points_b: Array, *, inlier_m: float, hypotheses: int, rng: np.random.Generator
+    points_a: Array,
+    points_b: Array,
+    *,
+    inlier_m: float,
+    hypotheses: int,
+    rng: np.random.Generator,
+    weighted: bool = True,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """The motion that most matched points agree on.
 
@@ -52,9 +58,10 @@ def ransac(
             does.
         hypotheses: three-point samples drawn.
         rng: draws them.
+        weighted: fit it to its inliers by `weighted_fit`; else only by `fit`, where just the inliers are wanted.
 
     Returns:
-        T_a_b [4, 4], fitted to its inliers by `weighted_fit`, and the inliers [n].
+        T_a_b [4, 4] and the inliers [n].
     """
     n = len(points_a)
     # three different indices per row, without rejection: the second and third skip those before them
@@ -80,7 +87,7 @@ def ransac(
             return best, inliers
         best = fit(points_a[inliers], points_b[inliers])
         inliers = agreeing(best)
-    if inliers.sum() < 3:
+    if inliers.sum() < 3 or not weighted:
         return best, inliers
     best = weighted_fit(points_a[inliers], points_b[inliers], best)
     return best, agreeing(best)

@@ -32,15 +32,23 @@ def measured(points: np.ndarray, rng: np.random.Generator, factor: float, angle_
     return ray * (depth_m + factor * DEPTH_NOISE.sigma_m(depth_m) * rng.standard_normal(len(points)))[:, None]
 
 
-def test_ransac_finds_the_motion_among_false_matches() -> None:
+@pytest.mark.parametrize("weighted", [True, False])
+def test_ransac_finds_the_motion_among_false_matches(weighted: bool) -> None:
     rng = np.random.default_rng(2)
     T = se3.exp([0.3, -0.2, 0.4, 0.5, -0.1, 0.2])
     points_b = rng.uniform([-1, -1, 1], [1, 1, 3], (60, 3))
     points_a = se3.transform(T, points_b) + rng.normal(0, 0.003, (60, 3))
     points_a[:35] = rng.uniform([-1, -1, 1], [1, 1, 3], (35, 3))
     found, inliers = ransac(
-        points_a, points_b, inlier_m=0.03, hypotheses=500, rng=random_streams.generator(0, "test")
+        points_a,
+        points_b,
+        inlier_m=0.03,
+        hypotheses=500,
+        rng=random_streams.generator(0, "test"),
+        weighted=weighted,
     )
+    if not weighted:
+        np.testing.assert_array_equal(found, fit(points_a[inliers], points_b[inliers]))
     assert inliers[35:].all()
     assert inliers[:35].sum() <= 2
     assert max(float(d) for d in se3.distance(found, T)) < 0.01
