@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from duagc.pipeline.config.fusion import FinetuneConfig
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import DepthKind
 
 Size = Mapping[str, int]
 """`frames`, `pixels` of an image and `keyframes` of a robot; `moved`: 1 if depth is of other times than color."""
@@ -27,6 +28,8 @@ FINAL_S = (0.0032, 0.087)
 """The same of a step of the final optimization."""
 MAPPING_OF_TILES, FINAL_OF_TILES = 1.9, 1.7
 """By how much longer a step takes in a map of many tiles, whose views see Gaussians of others (docs/lab, length)."""
+USUAL_DEPTH: DepthKind = "blended"
+"""Of maps, as far as is known before they are made: by their steps those of exact depth take about as long."""
 START_S = 2.0
 """Of a process."""
 INFORMATION_S, DEVIATION_S = 0.020, 0.10
@@ -63,6 +66,7 @@ def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
         mapping: how long its map is optimized.
     """
     frames, keyframes = size["frames"], size["keyframes"]
+    steps = mapping.steps(USUAL_DEPTH).keyframe
 
     def of(cost: tuple[float, float]) -> float:
         return _of_pixels(cost, size)
@@ -72,7 +76,7 @@ def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
         "start": START_S,
         "tracking": of(TRACKING_S) * frames + (of(TRACKING_S) * frames + moved if moved else 0.0),
         "poses": of(POSES_S) * frames + moved,
-        "mapping": of(MAPPING_S) * mapping.iterations * keyframes * _longer(MAPPING_OF_TILES, size, mapping),
+        "mapping": of(MAPPING_S) * steps * keyframes * _longer(MAPPING_OF_TILES, size, mapping),
         "final": of(FINAL_S) * _final_steps(size, mapping) * _longer(FINAL_OF_TILES, size, mapping),
         "model": of(MODEL_S) * frames + moved,
     }
@@ -202,7 +206,7 @@ def _final_steps(size: Size, mapping: MappingConfig) -> float:
         min(keyframes + mapping.support_views, size["frames"] / tiles)
         + (tiles > 1) * mapping.border_keyframes
     )
-    return tiles * mapping.final_steps(keyframes, views)
+    return tiles * mapping.final_steps(keyframes, views, USUAL_DEPTH)
 
 
 def _tiles(size: Size, mapping: MappingConfig) -> int:

@@ -2,7 +2,7 @@
 
 import math
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import Field, PositiveInt, field_validator
 
@@ -15,6 +15,27 @@ THICKNESS_FLOOR_M = 1e-3
 
 EXACT_DEPTH_OF_DISTANCE = 1e-3
 """Noise of exact depth is below this share of the distance: images of near things are less noisy, but not exact."""
+
+
+class TrainingSteps(NamedTuple):
+    """Steps of one view each.
+
+    Attributes:
+        keyframe: at a keyframe.
+        final: of the final optimization, for every keyframe.
+        final_view: the same for every view; the larger number of steps counts.
+    """
+
+    keyframe: int
+    final: int
+    final_view: int
+
+
+STEPS: dict[DepthKind, TrainingSteps] = {
+    "ray_plane": TrainingSteps(keyframe=32, final=64, final_view=16),
+    "blended": TrainingSteps(keyframe=24, final=76, final_view=19),
+}
+"""Where nothing else is set. On exact depth a step at a keyframe is worth more than one at the end."""
 
 
 class SeedingConfig(Config):
@@ -80,14 +101,17 @@ class MappingConfig(Config):
     """Most older keyframes, by the places they look at, whose overlap with a new one is computed."""
     random_keyframes: int = 2
     """Older keyframes added to the window at random, against forgetting."""
-    iterations: int = 24
-    """Optimization steps (one view each) at a keyframe; every second one is on the newest keyframe."""
+    iterations: int | None = Field(default=None, ge=0)
+    """Optimization steps (one view each) at a keyframe; every second one is on the newest keyframe. None: 24, or
+    32 where depth is exact."""
     iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""
-    final_iterations: int = 76
-    """Steps of the final optimization for every keyframe, at full size, shared by all views."""
-    final_iterations_view: int = 19
-    """The same for every view, keyframe or supporting frame; the larger number of steps counts."""
+    final_iterations: int | None = Field(default=None, ge=0)
+    """Steps of the final optimization for every keyframe, at full size, shared by all views. None: 76, or 64 where
+    depth is exact."""
+    final_iterations_view: int | None = Field(default=None, ge=0)
+    """The same for every view, keyframe or supporting frame; the larger number of steps counts. None: 19, or 16 where
+    depth is exact."""
     final_iterations_max: int = 6000
     """Most steps of the final optimization of a tile."""
     keyframe_megapixels_s: float | None = Field(default=None, ge=0.0)
@@ -160,6 +184,17 @@ class MappingConfig(Config):
         limit_m = min(self.exact_depth_m, EXACT_DEPTH_OF_DISTANCE * median_depth_m)
         return "ray_plane" if depth_noise_m is not None and depth_noise_m < limit_m else "blended"
 
+    def steps(self, depth: DepthKind) -> TrainingSteps:
+        """Steps of the optimization, without a budget.
+
+        Args:
+            depth: of the Gaussians, as it is drawn.
+        """
+        given = self.iterations, self.final_iterations, self.final_iterations_view
+        return TrainingSteps(
+            *(usual if n is None else n for n, usual in zip(given, STEPS[depth], strict=True))
+        )
+
     def for_depth(self, median_depth_m: float) -> "MappingConfig":
         """The settings of a map of what is so far away.
 
@@ -171,12 +206,13 @@ class MappingConfig(Config):
         largest_m = max(self.max_scale_m, self.max_scale_of_depth * median_depth_m)
         return self.model_copy(update={"max_scale_m": largest_m})
 
-    def final_steps(self, keyframes: float, views: float) -> float:
+    def final_steps(self, keyframes: float, views: float, depth: DepthKind) -> float:
         """Steps of the final optimization of a tile, without a budget.
 
         Args:
             keyframes: of the tile.
             views: that it is optimized with, keyframes too.
+            depth: of the Gaussians, as it is drawn.
         """
-        wanted = max(self.final_iterations * keyframes, self.final_iterations_view * views)
-        return min(wanted, self.final_iterations_max)
+        steps = self.steps(depth)
+        return min(max(steps.final * keyframes, steps.final_view * views), self.final_iterations_max)

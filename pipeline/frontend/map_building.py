@@ -77,7 +77,7 @@ class MapBuilder:
         self._checkpoints = checkpoints
         self.log, self.config, self.name, self.exposures = log, config, name, exposures
         self._seed, self._depth, self._threads, self._progress = seed, depth, threads, progress
-        self._budget = MappingBudget(config.mapping, log.camera)
+        self._budget = MappingBudget(config.mapping, log.camera, depth)
         self._free = FreeSpace(log.camera, config.moving)
         self._whole = GrowingMap(config.mapping, threads=threads)
         self._keyframes: Sequence[Keyframe] = ()
@@ -157,7 +157,7 @@ class MapBuilder:
             _, (first, updates, whole, grown) = saved
             self._whole.go_on(whole)
         steps = self._budget.keyframe_steps([keyframe.stamp_ns for keyframe in self._keyframes])
-        wanted = self.config.mapping.iterations * count
+        wanted = self.config.mapping.steps(self._depth).keyframe * count
         self._budget.say_left_out(
             self._checkpoints.say, self.name, (wanted - sum(steps), wanted), "keyframe_megapixels_s"
         )

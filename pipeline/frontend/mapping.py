@@ -128,7 +128,7 @@ class Mapper(MapContent):
         """
         super().__init__(camera, config, depth=depth or config.depth_kind(None), threads=threads, begun=begun)
         self.seed, self._tile = seed, tile
-        self.budget = MappingBudget(config, camera)
+        self.budget = MappingBudget(config, camera, self.depth)
         self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())
         self._limits = ScaleLimits.of(config)
         self._step = TrainingStep(self.rasterizer, self._loss_weights, self.depth)
@@ -202,10 +202,13 @@ class Mapper(MapContent):
         inserted, pruned = self._seed(view, self.config.first_share if first else self.config.keyframe_share)
         level = self.config.iterations_level
         views = [*self._borders, *self._views]
-        window = optimization_window(views, view, self.config, camera=self.cameras[0], seed=self.seed)
-        sparse = SparseSteps(self.config.sparse, self.cameras[level], len(window[:iterations]))
+        steps = self.config.steps(self.depth).keyframe
+        window = optimization_window(
+            views, view, self.config, steps=steps, camera=self.cameras[0], seed=self.seed
+        )[:iterations]
+        sparse = SparseSteps(self.config.sparse, self.cameras[level], len(window))
         losses, visits = [], Counter[int]()
-        for step, other in enumerate(window[:iterations]):
+        for step, other in enumerate(window):
             looked_at = sparse.at(step, visits[other.index])
             visits[other.index] += 1
             losses.append(self._optimize(other, level, self.config.rates, looked_at))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 
@@ -17,10 +18,12 @@ class MappingBudget:
     Attributes:
         config: of the mapping.
         camera: of all views.
+        depth: of the Gaussians, as it is drawn.
     """
 
     config: MappingConfig
     camera: PinholeCamera
+    depth: DepthKind
 
     def keyframe_steps(self, stamps_ns: Sequence[int]) -> list[int]:
         """Steps at each keyframe, by the time since the one before; at the first one all.
@@ -28,7 +31,7 @@ class MappingBudget:
         Args:
             stamps_ns: of the keyframes.
         """
-        most, camera = self.config.iterations, self.camera
+        most, camera = self.config.steps(self.depth).keyframe, self.camera
         limit = self.config.keyframe_megapixels_s
         if limit is None:
             return [most] * len(stamps_ns)
@@ -45,7 +48,7 @@ class MappingBudget:
             log_s: time that the log took to record.
         """
         config, sparse = self.config, self.config.sparse
-        wanted = int(config.final_steps(keyframes, views))
+        wanted = int(config.final_steps(keyframes, views, self.depth))
         if config.final_megapixels_s is None:
             return wanted, wanted
         seen = 1 - 0.5 * sparse.until if sparse.checkerboard else 1.0

@@ -13,14 +13,21 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 
 
 def optimization_window(
-    views: Sequence[View], newest: View, config: MappingConfig, *, camera: PinholeCamera, seed: int
+    views: Sequence[View],
+    newest: View,
+    config: MappingConfig,
+    *,
+    steps: int,
+    camera: PinholeCamera,
+    seed: int,
 ) -> list[View]:
-    """The views of a keyframe's iterations: every second one the newest, the others in turn.
+    """The views of the steps at a keyframe: every second one the newest, the others in turn.
 
     Args:
         views: those that may be chosen, in the order in which they were added.
         newest: the last of them.
-        config: numbers of views and iterations.
+        config: numbers of views.
+        steps: how many there are.
         camera: of all views.
         seed: of the run.
     """
@@ -30,7 +37,6 @@ def optimization_window(
     draw = random_streams.generator(seed, "mapping.window", keyframe=newest.index)
     random = draw.permutation(len(rest))[: config.random_keyframes]
     others = [*chosen, *(rest[k] for k in random)]
-    steps = config.iterations
     if not others:
         return [newest] * steps
     return [newest if k % 2 == 0 else others[(k // 2) % len(others)] for k in range(steps)]

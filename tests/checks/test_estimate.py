@@ -57,7 +57,7 @@ def test_maps_of_many_tiles_take_more_than_their_keyframes() -> None:
     """Views of a tile see Gaussians of others: measured 1.3 with two tiles (docs/lab, keyframes-of-a-log)."""
     one, two, many = ({"frames": 3000, "pixels": 160 * 120, "keyframes": n} for n in (64, 77, 480))
     final = [front_end_parts(size, MappingConfig())["final"] for size in (one, two, many)]
-    steps = [MappingConfig().final_iterations * n for n in (64, 77, 480)]
+    steps = [MappingConfig().steps("blended").final * n for n in (64, 77, 480)]
     a_step = np.array(final) / steps
     assert a_step[1] / a_step[0] == pytest.approx(1.34, rel=0.1)
     assert a_step[2] / a_step[0] == pytest.approx(1.6, rel=0.1)

@@ -1,7 +1,9 @@
 """Steps that a budget of pixels per second of log allows."""
 
-from duagc.pipeline.config.mapping import MappingConfig
-from duagc.pipeline.config.training import SparseStepsConfig
+import pytest
+
+from duagc.pipeline.config.mapping import STEPS, MappingConfig
+from duagc.pipeline.config.training import DepthKind, SparseStepsConfig
 from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.geometry.camera import PinholeCamera
 
@@ -11,7 +13,21 @@ STAMPS_NS = [0, 1_000_000_000, 5_000_000_000]
 
 def budget(**settings: object) -> MappingBudget:
     steps = {"iterations": 10, "final_iterations": 90, "final_iterations_view": 22}
-    return MappingBudget(MappingConfig.model_validate(steps | settings), CAMERA)
+    return MappingBudget(MappingConfig.model_validate(steps | settings), CAMERA, "blended")
+
+
+def test_exact_depth_takes_more_steps_at_keyframes_and_fewer_at_the_end() -> None:
+    exact, noisy = (MappingBudget(MappingConfig(), CAMERA, depth) for depth in ("ray_plane", "blended"))
+    assert exact.keyframe_steps(STAMPS_NS) == [32] * 3
+    assert noisy.keyframe_steps(STAMPS_NS) == [24] * 3
+    assert [b.final_steps(10, 10, 1.0)[0] for b in (exact, noisy)] == [640, 760]
+    assert [b.final_steps(10, 50, 1.0)[0] for b in (exact, noisy)] == [800, 950]
+
+
+@pytest.mark.parametrize("depth", STEPS)
+def test_steps_that_are_set_are_those_of_any_depth(depth: DepthKind) -> None:
+    config = MappingConfig(iterations=0, final_iterations=3)
+    assert config.steps(depth) == (0, 3, STEPS[depth].final_view)
 
 
 def test_without_a_budget_all_steps_are_taken() -> None:

@@ -174,7 +174,7 @@ def test_a_budget_that_is_too_small_is_said(sensor_log: Path) -> None:
     run_frontend(sensor_log, out, config, checkpoints=Checkpoints(say=said.append))
     stamps_ns = [m.stamp_ns for m in messages(out, topics.KEYFRAME)]
     assert len(stamps_ns) > 2
-    steps = MappingBudget(mapping, CAMERA).keyframe_steps(stamps_ns)
+    steps = MappingBudget(mapping, CAMERA, "blended").keyframe_steps(stamps_ns)
     assert steps[0] == 6
     wanted, final = 6 * len(stamps_ns), 4 * len(stamps_ns)
     assert [line for line in said if line.startswith("warning")] == [
