@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from duagc.pipeline.cache.durations import evaluation_s, front_end_parts, front_end_s, fusion_s
+from duagc.pipeline.cache.durations import USUAL_DEPTH, evaluation_s, front_end_parts, front_end_s, fusion_s
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store, StoredResults
 from duagc.pipeline.checks.estimate import estimate
@@ -57,7 +57,7 @@ def test_maps_of_many_tiles_take_more_than_their_keyframes() -> None:
     """Views of a tile see Gaussians of others: measured 1.3 with two tiles (docs/lab, keyframes-of-a-log)."""
     one, two, many = ({"frames": 3000, "pixels": 160 * 120, "keyframes": n} for n in (64, 77, 480))
     final = [front_end_parts(size, MappingConfig())["final"] for size in (one, two, many)]
-    steps = [MappingConfig().steps("blended").final * n for n in (64, 77, 480)]
+    steps = [MappingConfig().steps(USUAL_DEPTH).final * n for n in (64, 77, 480)]
     a_step = np.array(final) / steps
     assert a_step[1] / a_step[0] == pytest.approx(1.34, rel=0.1)
     assert a_step[2] / a_step[0] == pytest.approx(1.6, rel=0.1)

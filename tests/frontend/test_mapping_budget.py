@@ -2,17 +2,18 @@
 
 import pytest
 
-from duagc.pipeline.config.mapping import STEPS, MappingConfig
+from duagc.pipeline.config.mapping import STEPS, MappingConfig, TrainingSteps
 from duagc.pipeline.config.training import DepthKind, SparseStepsConfig
 from duagc.pipeline.frontend.mapping_budget import MappingBudget
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 CAMERA = PinholeCamera(1000, 500, 400.0, 400.0, 500.0, 250.0)  # half a megapixel
+SETTINGS = "iterations", "final_iterations", "final_iterations_view"
 STAMPS_NS = [0, 1_000_000_000, 5_000_000_000]
 
 
 def budget(**settings: object) -> MappingBudget:
-    steps = {"iterations": 10, "final_iterations": 90, "final_iterations_view": 22}
+    steps = dict(zip(SETTINGS, (10, 90, 22), strict=True))
     return MappingBudget(MappingConfig.model_validate(steps | settings), CAMERA, "blended")
 
 
@@ -28,6 +29,13 @@ def test_exact_depth_takes_more_steps_at_keyframes_and_fewer_at_the_end() -> Non
 def test_steps_that_are_set_are_those_of_any_depth(depth: DepthKind) -> None:
     config = MappingConfig(iterations=0, final_iterations=3)
     assert config.steps(depth) == (0, 3, STEPS[depth].final_view)
+
+
+@pytest.mark.parametrize(("name", "setting"), [*zip(TrainingSteps._fields, SETTINGS, strict=True)])
+def test_settings_say_the_steps_that_stand_for_none(name: str, setting: str) -> None:
+    exact, noisy = (getattr(STEPS[depth], name) for depth in ("ray_plane", "blended"))
+    said = " ".join((MappingConfig.model_fields[setting].description or "").split())
+    assert said.endswith(f"None: {noisy}, or {exact} where depth is exact.")
 
 
 def test_without_a_budget_all_steps_are_taken() -> None:
