@@ -90,9 +90,9 @@ def test_a_killed_run_resumes_and_finished_stages_are_never_computed_again(tmp_p
 
 
 def last_saved_s(folder: Path) -> float:
-    """When a front end has saved where it is."""
-    times = [0.0]
-    for path in (folder / ".duagc-store" / "checkpoints").rglob("*.[sd]*"):
+    """When a front end has saved where it is, or one has ended: its results are kept, its checkpoints are not."""
+    times, store = [0.0], folder / ".duagc-store"
+    for path in (*(store / "checkpoints").rglob("*.[sd]*"), *(store / "entries").rglob("*.json")):
         with suppress(FileNotFoundError):
             times.append(path.stat().st_mtime)
     return max(times)
