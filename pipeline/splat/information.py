@@ -10,6 +10,8 @@ Without the cross terms the blocks are conditional, not marginal, information. Z
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,8 +29,9 @@ COLOR_INFORMATION, OPACITY_INFORMATION = slice(27, 30), 30
 """Places in information."""
 
 GEOMETRY_SIZE = 45
-_UPPER = np.triu_indices(9)
-_MEAN_BLOCK, _LOG_COVARIANCE_BLOCK = slice(0, 3), slice(3, 9)  # rows and columns of the 9x9
+_ROWS, _COLUMNS = np.triu_indices(9)
+_MEAN_PLACES = np.flatnonzero(_COLUMNS < 3)  # of the upper triangles of blocks in that of the 9x9
+_LOG_COVARIANCE_PLACES = np.flatnonzero(_ROWS >= 3)
 
 
 def _diagonal_of_upper(size: int) -> NDArray[np.int64]:
@@ -53,17 +56,28 @@ WORST_CONDITION = 1e12
 def unpack_symmetric(upper: ArrayLike, size: int) -> Array:
     """Symmetric matrices [..., size, size] of their upper triangles, row by row."""
     upper = np.asarray(upper, dtype=np.float64)
-    rows, columns = np.triu_indices(size)
-    out = np.empty((*upper.shape[:-1], size, size))
-    out[..., rows, columns] = upper
-    out[..., columns, rows] = upper
-    return out
+    return np.take(upper, _places_of_elements(size), axis=-1).reshape(*upper.shape[:-1], size, size)
 
 
 def pack_symmetric(matrix: Array) -> Array:
     """Upper triangles, row by row, of symmetric matrices [..., size, size]."""
-    rows, columns = np.triu_indices(matrix.shape[-1])
-    return matrix[..., rows, columns]
+    size = matrix.shape[-1]
+    return np.take(matrix.reshape(*matrix.shape[:-2], size * size), _places_of_upper(size), axis=-1)
+
+
+@cache
+def _places_of_upper(size: int) -> NDArray[np.int64]:
+    """Of the upper triangle, row by row, in a matrix [size * size]."""
+    return np.ravel_multi_index(np.triu_indices(size), (size, size)).astype(np.int64)
+
+
+@cache
+def _places_of_elements(size: int) -> NDArray[np.int64]:
+    """Of all elements [size * size] of a symmetric matrix in its upper triangle; faster than to index twice."""
+    places = np.empty((size, size), np.int64)
+    rows, columns = np.triu_indices(size)
+    places[rows, columns] = places[columns, rows] = np.arange(len(rows))
+    return places.ravel()
 
 
 def pack_information(mean: Array, log_covariance: Array, color: Array, opacity: Array) -> Array:
@@ -97,15 +111,15 @@ def unpack_geometry(geometry: ArrayLike) -> Array:
 
 def pack_geometry(matrices: Array) -> Array:
     """Geometry [n, 45] of symmetric matrices [n, 9, 9]."""
-    return matrices[:, _UPPER[0], _UPPER[1]]
+    return pack_symmetric(matrices)
 
 
 def information_of_geometry(geometry: ArrayLike, color: ArrayLike, opacity: ArrayLike) -> Array:
     """Information [n, 31] of geometry [n, 45], color [n, 3] and opacity [n]; the cross terms are dropped."""
-    full = unpack_geometry(geometry)
-    out = np.empty((len(full), INFORMATION_SIZE))
-    out[:, MEAN_INFORMATION] = pack_symmetric(full[:, _MEAN_BLOCK, _MEAN_BLOCK])
-    out[:, LOG_COVARIANCE_INFORMATION] = pack_symmetric(full[:, _LOG_COVARIANCE_BLOCK, _LOG_COVARIANCE_BLOCK])
+    upper = np.asarray(geometry, dtype=np.float64)
+    out = np.empty((len(upper), INFORMATION_SIZE))
+    out[:, MEAN_INFORMATION] = upper[:, _MEAN_PLACES]
+    out[:, LOG_COVARIANCE_INFORMATION] = upper[:, _LOG_COVARIANCE_PLACES]
     out[:, COLOR_INFORMATION] = color
     out[:, OPACITY_INFORMATION] = opacity
     return out
@@ -113,10 +127,10 @@ def information_of_geometry(geometry: ArrayLike, color: ArrayLike, opacity: Arra
 
 def geometry_of_information(information: Array) -> Array:
     """Geometry [n, 45] of information [n, 31]; the cross terms are zero."""
-    full = np.zeros((len(information), 9, 9))
-    full[:, _MEAN_BLOCK, _MEAN_BLOCK] = mean_block(information)
-    full[:, _LOG_COVARIANCE_BLOCK, _LOG_COVARIANCE_BLOCK] = log_covariance_block(information)
-    return pack_geometry(full)
+    out = np.zeros((len(information), len(_ROWS)))
+    out[:, _MEAN_PLACES] = information[:, MEAN_INFORMATION]
+    out[:, _LOG_COVARIANCE_PLACES] = information[:, LOG_COVARIANCE_INFORMATION]
+    return out
 
 
 def theta_of(gaussians: Gaussians) -> Array:
