@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.evaluation.image_metrics import decibels
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
 from duagc.pipeline.splat.losses import Rendered
@@ -83,7 +84,12 @@ def fit_exposure(drawn: Array, image: Array) -> tuple[float, float] | Absent:
 
 
 def fitted_psnr(
-    render: Rendered, image: Array, valid: NDArray[np.bool_] | None = None, *, seen: Image | None = None
+    render: Rendered,
+    image: Array,
+    valid: NDArray[np.bool_] | None = None,
+    *,
+    color: Image | None = None,
+    seen: Image | None = None,
 ) -> FittedPsnr | Absent:
     """PSNR of each half of a view in the exposure that was fitted on the other half.
 
@@ -93,6 +99,7 @@ def fitted_psnr(
         render: of the map, on black.
         image: colors [h, w, 3] in 0..1.
         valid: bool [h, w], pixels that are fitted and scored; None: all.
+        color: `planes` of the render, where more is done with them; None: made here.
         seen: `planes` of the image, where several renders are compared with it; None: made here.
 
     Returns:
@@ -103,16 +110,20 @@ def fitted_psnr(
     covered = counted & (render.alpha >= MIN_ALPHA)
     whole = bool(counted.all())
     halves = (slice(0, width // 2), slice(width // 2, width))
-    color, alpha, errors = planes(render.color), render.alpha, []
+    color = planes(render.color) if color is None else color
     seen = planes(image) if seen is None else seen
+    sums, counts = [], []
     for scored, other in (halves, halves[::-1]):
-        squares = _squared_errors((color, alpha, seen), scored, other, covered=covered)
+        squares = _squared_errors((color, render.alpha, seen), scored, other, covered=covered)
         if isinstance(squares, Absent):
             return squares
-        errors.append(squares.reshape(3, -1) if whole else squares[:, counted[:, scored]])
-    if not all(error.size for error in errors):
+        squares = squares if whole else squares[:, counted[:, scored]]
+        sums.append(float(np.sum(squares, dtype=np.float64)))
+        counts.append(squares.size)
+    if not all(counts):
         return Absent("half of the image has no valid pixel")
-    return FittedPsnr(_psnr(errors[0]), _psnr(errors[1]), _psnr(np.concatenate(errors, axis=1)))
+    left, right = (decibels(total / count) for total, count in zip(sums, counts, strict=True))
+    return FittedPsnr(left, right, decibels(sum(sums) / sum(counts)))
 
 
 def _squared_errors(
@@ -156,8 +167,3 @@ def _thinned(used: NDArray[np.bool_]) -> tuple[NDArray[np.intp], ...]:
     stride = max(1, int(np.sqrt(used.size / MOST_PIXELS)))
     first = stride // 2
     return tuple(first + stride * at for at in np.nonzero(used[first::stride, first::stride]))
-
-
-def _psnr(squares: Image) -> float:
-    mse = float(np.mean(squares, dtype=np.float64))
-    return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))

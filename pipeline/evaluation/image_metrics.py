@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,35 @@ def psnr(rendered: NDArray, reference: NDArray, mask: NDArray[np.bool_] | None =
         reference: colors [H, W, 3] in 0..1.
         mask: bool [H, W], pixels that count; None: all.
     """
-    clipped = np.clip(np.asarray(rendered), 0, 1)
-    error = np.subtract(clipped, reference, dtype=np.float64)
+    error = np.clip(np.asarray(rendered), 0, 1) - reference
     if mask is not None and not mask.all():
         error = error[mask]
-    error *= error
-    mse = float(np.mean(error))
+    return decibels(float(np.mean(np.square(error, out=error), dtype=np.float64)))
+
+
+def psnr_of_planes(
+    rendered: NDArray[np.floating], reference: NDArray[np.floating], mask: NDArray[np.bool_] | None = None
+) -> float:
+    """The function `psnr` of colors by channel, which is faster.
+
+    Args:
+        rendered: colors [3, H, W], clipped to 0..1 first.
+        reference: colors [3, H, W] in 0..1.
+        mask: bool [H, W], pixels that count; None: all.
+    """
+    error = np.clip(rendered, 0, 1)
+    error -= reference
+    if mask is not None and not mask.all():
+        error = error[:, mask]
+    return decibels(float(np.mean(np.square(error, out=error), dtype=np.float64)))
+
+
+def decibels(mse: float) -> float:
+    """PSNR in dB of colors 0..1; none is lost: infinity.
+
+    Args:
+        mse: mean square of the errors.
+    """
     return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))
 
 
@@ -37,12 +61,19 @@ _C1, _C2 = 0.01**2, 0.03**2
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
+@cache
+def _window() -> Image:
+    """Weights of a row of the window."""
+    import cv2
+
+    return np.asarray(cv2.getGaussianKernel(2 * _WINDOW_RADIUS + 1, _WINDOW_SIGMA, cv2.CV_32F))
+
+
 def _window_mean(image: Image) -> Image:
     """11x11 Gaussian-weighted mean (sigma 1.5), only where the window lies inside the image."""
     import cv2
 
-    weights = cv2.getGaussianKernel(2 * _WINDOW_RADIUS + 1, _WINDOW_SIGMA, cv2.CV_32F)
-    smooth = cv2.sepFilter2D(image, cv2.CV_32F, weights, weights)
+    smooth = cv2.sepFilter2D(image, cv2.CV_32F, _window(), _window())
     inside = slice(_WINDOW_RADIUS, -_WINDOW_RADIUS)
     return np.asarray(smooth[inside, inside])
 

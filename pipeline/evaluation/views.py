@@ -111,13 +111,18 @@ def score_view(
         exact_m = exact_m if isinstance(exact_m, Absent) else np.where(mask, exact_m, np.float32(0))
     l1_m, completeness = _depth(render, depth_m, "recorded")
     ssim, ms_ssim = _structure(render, image.structure, min(image.color.shape[:2]))
-    psnr_db = _psnr(render, image)
-    fitted = _psnr_in_fitted_exposure(render, image)
-    interpolated_db = psnr_db if exposure is None else _psnr(in_exposure(render, exposure), image)
+    colors = planes(render.color)
+    psnr_db = _psnr(colors, image)
+    fitted = _psnr_in_fitted_exposure(render, colors, image)
+    interpolated_db = (
+        psnr_db if exposure is None else _psnr(exposure.planes_in_image(colors, render.alpha), image)
+    )
     return ViewScore(
         psnr_db=psnr_db,
         psnr_interpolated_db=interpolated_db,
-        psnr_moved_db=interpolated_db if moved is None else _psnr(in_exposure(moved, exposure), image),
+        psnr_moved_db=interpolated_db
+        if moved is None
+        else _psnr(planes(in_exposure(moved, exposure).color), image),
         psnr_exposure_db=fitted[0],
         psnr_exposure_left_db=fitted[1],
         psnr_exposure_right_db=fitted[2],
@@ -143,15 +148,17 @@ def in_exposure(render: Render, exposure: Exposure | None) -> Render:
     return replace(render, color=exposure.in_image(render.color, render.alpha))
 
 
-def _psnr(render: Render, image: ComparedImage) -> Score:
+def _psnr(colors: NDArray[np.float32], image: ComparedImage) -> Score:
     if image.mask is not None and not image.mask.any():
         return NO_PIXEL
-    return min(image_metrics.psnr(render.color, image.color, image.mask), PSNR_CEILING_DB)
+    return min(image_metrics.psnr_of_planes(colors, image.planes, image.mask), PSNR_CEILING_DB)
 
 
-def _psnr_in_fitted_exposure(render: Render, image: ComparedImage) -> tuple[Score, Score, Score]:
+def _psnr_in_fitted_exposure(
+    render: Render, colors: NDArray[np.float32], image: ComparedImage
+) -> tuple[Score, Score, Score]:
     """PSNR of the whole view, its left and its right half, each half in the exposure fitted on the other."""
-    found = fitted_psnr(render, image.color, image.mask, seen=image.planes)
+    found = fitted_psnr(render, image.color, image.mask, color=colors, seen=image.planes)
     if isinstance(found, Absent):
         return found, found, found
     both, left, right = (min(value, PSNR_CEILING_DB) for value in (found.both, found.left, found.right))

@@ -20,7 +20,7 @@ from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.exposure import Exposure, ExposureTrack
+from duagc.pipeline.geometry.exposure import Exposure, ExposureTrack, unit_color, unit_table
 from duagc.pipeline.information.stage import run_information
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.recording import RgbdFrame, read_exposures, read_log
@@ -263,3 +263,18 @@ def test_depth_with_one_large_hole_is_read_as_before() -> None:
     whole, blocks = ColorBlocks.of(f, CAMERA, 40), ColorBlocks.of(replace(f, depth=half), CAMERA, 40)
     np.testing.assert_array_equal(blocks.inverse_depth[:, :20], whole.inverse_depth[:, :20])
     assert np.isnan(blocks.inverse_depth[:, 20:]).all()
+
+
+@pytest.mark.parametrize("exposed", [False, True])
+def test_what_a_training_takes_of_an_image_is_the_image_in_the_colors_of_the_map(exposed: bool) -> None:
+    random = np.random.default_rng(1)
+    exposure = (
+        Exposure(np.array([0.8, 1.0, 1.3]), np.array([0.02, 0.0, -0.03]), np.ones(3)) if exposed else None
+    )
+    color, alpha = random.integers(0, 256, (6, 8, 3), np.uint8), random.random((6, 8), np.float32)
+    assert np.array_equal(unit_table(exposure)[color, np.arange(3)], unit_color(color, exposure))
+    if exposure is not None:
+        planes = np.ascontiguousarray(np.moveaxis(unit_color(color, exposure), -1, 0))
+        by_plane = exposure.planes_in_image(planes, alpha)
+        whole = exposure.in_image(unit_color(color, exposure), alpha)
+        assert np.array_equal(np.moveaxis(by_plane, 0, -1), whole)
