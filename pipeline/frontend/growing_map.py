@@ -16,7 +16,7 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.geometry.view_extent import radii_m
 from duagc.pipeline.kernels import CompiledAdam, Gradients
-from duagc.pipeline.kernels.training import ScaleLimits, step_rows
+from duagc.pipeline.kernels.training import ScaleLimits, step_in_place
 from duagc.pipeline.splat.gaussians import Gaussians
 
 Indices = NDArray[np.int64]
@@ -202,7 +202,21 @@ class GrowingMap:
             gradients = gradients.of_rows(slice(len(guests), None))
         else:
             rows = np.concatenate([guests, rows])
-        step_rows(self.gaussians, self.adam, rows, gradients=gradients, rates=rates, limits=limits)
+        step_in_place(self.gaussians, self.adam, gradients, rates=rates, limits=limits, rows=rows)
+
+    def step_all(self, gradients: Gradients, rates: LearningRates, *, limits: ScaleLimits) -> None:
+        """Take an optimization step of all Gaussians, in place.
+
+        Args:
+            gradients: of a loss by them.
+            rates: step lengths.
+            limits: of the log-scales.
+        """
+        step_in_place(self.gaussians, self.adam, gradients, rates=rates, limits=limits)
+
+    def own_arrays(self) -> None:
+        """Before steps in place: whoever has the Gaussians of now keeps them as they are."""
+        self.gaussians = self.gaussians.copy()
 
     @property
     def _own(self) -> slice:

@@ -30,7 +30,7 @@ from duagc.pipeline.kernels.training import (
     ScaleLimits,
     TrainingStep,
     TrainingView,
-    step_rows,
+    step_in_place,
 )
 from duagc.pipeline.splat.map_cells import MapCells
 from duagc.pipeline.splat.optimizer import smoothstep_decay
@@ -155,7 +155,7 @@ class JointTraining:
             closing=looked_at.closing,
         )
         rates = self._config.rates.times(share)
-        step_rows(whole.gaussians, whole.adam, rows, gradients=gradients, rates=rates, limits=self._limits)
+        step_in_place(whole.gaussians, whole.adam, gradients, rates=rates, limits=self._limits, rows=rows)
         if moves:
             assert gradients.pose is not None  # it was asked for
             tangent = self._pose_steps.step(chosen, gradients.pose, self._config.pose_rate * share)

@@ -207,6 +207,7 @@ class Mapper(MapContent):
             views, view, self.config, steps=steps, camera=self.cameras[0], seed=self.seed
         )[:iterations]
         sparse = SparseSteps(self.config.sparse, self.cameras[level], len(window))
+        self._map.own_arrays()
         losses, visits = [], Counter[int]()
         for step, other in enumerate(window):
             looked_at = sparse.at(step, visits[other.index])
@@ -296,6 +297,7 @@ class Mapper(MapContent):
             poses.go_on(found[1])
             self.go_on(found[2])
         turns = random_streams.in_turn(self.seed, "mapping.finish", len(views), first=first, **self._of_tile)
+        self._map.own_arrays()
         for step in range(first, alone):
             if step in rounds:
                 number = rounds.index(step)
@@ -361,9 +363,7 @@ class Mapper(MapContent):
             guests = self._guests(view)
             self._map.step(guests, gradients, rates, limits=self._limits, keep_guests=keep_guests)
         else:
-            self._map.gaussians = self._step.stepped(
-                self._map.gaussians, gradients, adam=self._map.adam, rates=rates, limits=self._limits
-            )
+            self._map.step_all(gradients, rates, limits=self._limits)
         if pose_step is not None:
             assert gradients.pose is not None  # it was asked for
             view.T_map_camera = view.T_map_camera @ se3.exp(pose_step(gradients.pose))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import masks, projection, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.exposure import Exposure, unit_color
+from duagc.pipeline.geometry.exposure import Exposure, unit_color, unit_table
 from duagc.pipeline.kernels.training import TrainingView
 from duagc.pipeline.splat.losses import DepthTrust, depth_certainty, halve
 
@@ -126,10 +126,11 @@ class View:
 
     def training(self, level: int) -> TrainingView:
         """The images of a level as a training step takes them."""
-        color, depth_m = self.images(level)
-        certainty = self.certainty if level == 0 else self.half_certainty
-        mask = self.usable(level)
-        return TrainingView(color, depth_m, self.T_map_camera, mask, certainty, self.T_camera_moment)
+        mask, pose, moments = self.usable(level), self.T_map_camera, self.T_camera_moment
+        if level:
+            return TrainingView(self.half_color, self.half_depth_m, pose, mask, self.half_certainty, moments)
+        table = unit_table(self.exposure)
+        return TrainingView(self.color, self.depth_m, pose, mask, self.certainty, moments, color_table=table)
 
     def usable(self, level: int) -> NDArray[np.bool_] | None:
         """The mask of a level; None = all pixels.

@@ -27,7 +27,7 @@ from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, checkerboards
-from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView
+from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView, step_in_place
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.recording.moved_depth import DepthMotion
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -218,16 +218,10 @@ class ShutterSearch:
         self, gaussians: Gaussians, adam: CompiledAdam, trained: Sequence[_Timed], shutter_s: float
     ) -> Gaussians:
         """The map after some training steps, each on a keyframe, in turn."""
-        limits = ScaleLimits.of(self._config)
+        limits, sharpened = ScaleLimits.of(self._config), gaussians.copy()
         for step in range(STEPS):
             turn, number = divmod(step, len(trained))
             view = self._view(trained[number], shutter_s, self._boards[turn % 2])
-            gaussians, _ = self._step(
-                gaussians,
-                self._camera,
-                view,
-                adam=adam,
-                rates=self._config.rates,
-                limits=limits,
-            )
-        return gaussians
+            _, gradients = self._step.gradients(sharpened, self._camera, view)
+            step_in_place(sharpened, adam, gradients, rates=self._config.rates, limits=limits)
+        return sharpened

@@ -29,11 +29,11 @@ from duagc.pipeline.kernels.training import (
     ScaleLimits,
     TrainingStep,
     TrainingView,
-    step_rows,
+    step_in_place,
 )
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.map_cells import MapCells
-from duagc.pipeline.splat.optimizer import TRAINED, smoothstep_decay
+from duagc.pipeline.splat.optimizer import smoothstep_decay
 
 PEERS_UNTIL = 0.6
 """Share of the steps after which only own images are used."""
@@ -119,7 +119,8 @@ class _Training:
         *,
         in_parts: bool,
     ) -> None:
-        self.gaussians, self._trained, self._camera = gaussians, trained, context.camera
+        self.gaussians = gaussians.copy()  # it changes in place
+        self._trained, self._camera = trained, context.camera
         weights = LossWeights(**context.config.finetune.loss.of(context.depth_kind).model_dump())
         self._take = TrainingStep(Rasterizer(threads=context.threads), weights, context.depth_kind)
         self._adam = CompiledAdam(len(gaussians), threads=context.threads)
@@ -127,8 +128,6 @@ class _Training:
         # thinner ones stay as they are
         self._floor = np.minimum(gaussians.log_scales, np.float32(np.log(floor_m)))
         self._cells = MapCells.of(gaussians) if in_parts else None
-        if in_parts:
-            self.gaussians = gaussians.select(np.arange(len(gaussians)))  # of its own: parts change in place
 
     def state(self) -> tuple[Any, ...]:
         """From which the training can go on."""
@@ -142,36 +141,12 @@ class _Training:
     def step(self, view: PosedRgbd, looked_at: LookedAt, rates: LearningRates) -> None:
         """Take a step on a view."""
         image = looked_at.of(TrainingView.of(view, self._take.loss))
-        if self._cells is None:
-            self.gaussians = self._stepped(image, looked_at.closing, rates)
-            return
-        rows = self._cells.seen(view.depth_m, view.T_world_camera, self._camera)
-        seen = self.gaussians.select(rows)
+        rows, seen = None, self.gaussians
+        if self._cells is not None:
+            rows = self._cells.seen(view.depth_m, view.T_world_camera, self._camera)
+            seen = self.gaussians.select(rows)
         _, gradients = self._take.gradients(seen, self._camera, image, closing=looked_at.closing)
-        if self._trained is not None:
-            chosen = np.flatnonzero(self._trained[rows])
-            rows, gradients = rows[chosen], gradients.of_rows(chosen)
         limits = ScaleLimits(self._floor)
-        step_rows(self.gaussians, self._adam, rows, gradients=gradients, rates=rates, limits=limits)
-
-    def _stepped(self, image: TrainingView, closing: float, rates: LearningRates) -> Gaussians:
-        """The whole map after a step."""
-        stepped, _ = self._take(
-            self.gaussians,
-            self._camera,
-            image,
-            adam=self._adam,
-            rates=rates,
-            limits=ScaleLimits(self._floor),
-            closing=closing,
+        step_in_place(
+            self.gaussians, self._adam, gradients, rates=rates, limits=limits, rows=rows, chosen=self._trained
         )
-        return stepped if self._trained is None else _where(self._trained, stepped, self.gaussians)
-
-
-def _where(chosen: NDArray[np.bool_], a: Gaussians, b: Gaussians) -> Gaussians:
-    """The Gaussians of `a` where chosen, else those of `b`."""
-    values = {}
-    for name in TRAINED:
-        x, y = getattr(a, name), getattr(b, name)
-        values[name] = np.where(chosen.reshape(-1, *[1] * (x.ndim - 1)), x, y)
-    return b.replace(**values)

@@ -36,8 +36,7 @@ class Exposure:
         Args:
             color: RGB [h, w, 3], as taken.
         """
-        # a table of all 256 values: every step of a training converts an image
-        return np.asarray(cv2.LUT(color, self.table[None]), dtype=np.float32)
+        return by_table(color, self.table)
 
     @cached_property
     def table(self) -> NDArray[np.float32]:
@@ -87,6 +86,16 @@ def unit_color(color: NDArray[np.uint8], exposure: Exposure | None) -> NDArray[n
         exposure: of the image; None: as the map.
     """
     return color * np.float32(1 / 255) if exposure is None else exposure.in_map(color)
+
+
+def by_table(color: NDArray[np.uint8], table: NDArray[np.float32]) -> NDArray[np.float32]:
+    """An image [h, w, 3] of what its values stand for.
+
+    Args:
+        color: RGB [h, w, 3], as taken.
+        table: [256, 3], by value of a channel.
+    """
+    return np.asarray(cv2.LUT(color, table[None]), dtype=np.float32)
 
 
 def unit_table(exposure: Exposure | None) -> NDArray[np.float32]:

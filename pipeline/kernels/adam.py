@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.kernels import _raster
-from duagc.pipeline.kernels.outputs import empty
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, EPSILON, Adam, GaussianGradients
 
 _CONSTANTS = np.array([BETA_1, 1 - BETA_1, BETA_2, 1 - BETA_2, EPSILON], np.float32)
+_ALL_ROWS, _ALL = np.zeros(0, np.int64), np.zeros(0, np.uint8)
 
 
 class CompiledAdam(Adam):
@@ -26,65 +26,54 @@ class CompiledAdam(Adam):
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
         """The Gaussians after one step; those without any gradient of color or opacity are untouched."""
-        if len(gaussians) != len(self):
-            raise ValueError(f"gaussians are {len(gaussians)}, expected {len(self)}, as many as have a state")
-        names = list(self._first)
-        values = [getattr(gaussians, name) for name in names]
-        for name, value in zip(names, values, strict=True):
-            _check_gradient(name, getattr(gradients, name), value.shape)
-            for moments in (self._first[name], self._second[name]):
-                _check_state(moments, np.float32)
-        _check_state(self._steps, np.int32)
-        out = [empty(*value.shape) for value in values]
-        arrays = (
-            values,
-            [getattr(gradients, name) for name in names],
-            [self._first[name] for name in names],
-            [self._second[name] for name in names],
-            out,
-        )
-        step_lengths = np.array([getattr(rates, name) for name in names], np.float32)
-        touched_by = (gradients.colors, gradients.opacity_logits)
-        state = (self._steps, self._corrections)
-        arguments = (*arrays, step_lengths, _CONSTANTS, *touched_by, *state, operator.index(self.threads))
-        _raster.adam(self.isa, *arguments)
-        return gaussians.replace(**dict(zip(names, out, strict=True)))
+        out = gaussians.copy()
+        nowhere = np.array([-np.inf], np.float32)
+        self.step_in_place(out, gradients, rates, least=nowhere, limits=(np.inf, np.inf))
+        return out
 
-    def step_rows(
+    def step_in_place(
         self,
         gaussians: Gaussians,
-        rows: NDArray[np.int64],
         gradients: GaussianGradients,
         rates: LearningRates,
         *,
         least: NDArray[np.float32],
         limits: tuple[float, float],
+        rows: NDArray[np.int64] | None = None,
+        chosen: NDArray[np.bool_] | None = None,
     ) -> None:
-        """A step of some Gaussians in place, and what is beyond the limits is put there.
+        """A step of some Gaussians in place, and what of them is beyond the limits is put there.
 
         Args:
-            gaussians: all of them; those of the rows are changed.
-            rows: [m], each once.
-            gradients: [m] by these.
+            gaussians: all of them.
+            gradients: by those of the rows, in their order.
             rates: step lengths.
             least: of the log-scales, [n, 3] or [1].
             limits: the greatest log-scale, and the largest opacity logit of either sign.
+            rows: [m], each once; None: all.
+            chosen: [n], which may change; None: all.
         """
-        if len(gaussians) != len(self):
-            raise ValueError(f"gaussians are {len(gaussians)}, expected {len(self)}, as many as have a state")
-        if len(rows) and (rows.min() < 0 or rows.max() >= len(self)):
-            raise ValueError(f"rows are {rows.min()} to {rows.max()}, expected 0 to {len(self) - 1}")
+        n = len(gaussians)
+        if n != len(self):
+            raise ValueError(f"gaussians are {n}, expected {len(self)}, as many as have a state")
+        if rows is not None and len(rows) and (rows.min() < 0 or rows.max() >= n):
+            raise ValueError(f"rows are {rows.min()} to {rows.max()}, expected 0 to {n - 1}")
         if least.shape not in ((1,), gaussians.log_scales.shape):
             raise ValueError(
                 f"least has shape {least.shape}, expected (1,) or {gaussians.log_scales.shape}, that of the log-scales"
             )
+        if chosen is not None and (chosen.dtype != np.bool_ or chosen.shape != (n,)):
+            raise ValueError(f"chosen is {chosen.dtype} {chosen.shape}, expected bool ({n},)")
         names = list(self._first)
         values = [getattr(gaussians, name) for name in names]
+        count = n if rows is None else len(rows)
         for name, value in zip(names, values, strict=True):
-            _check_gradient(name, getattr(gradients, name), (len(rows), *value.shape[1:]))
+            _check_gradient(name, getattr(gradients, name), (count, *value.shape[1:]))
             for array in (value, self._first[name], self._second[name]):
                 _check_state(array, np.float32)
         _check_state(self._steps, np.int32)
+        if not count:
+            return
         arrays = (
             values,
             [getattr(gradients, name) for name in names],
@@ -93,9 +82,10 @@ class CompiledAdam(Adam):
         )
         step_lengths = np.array([getattr(rates, name) for name in names], np.float32)
         touched_by = (gradients.colors, gradients.opacity_logits)
-        clipped = (gaussians.log_scales, gaussians.opacity_logits, least, np.array(limits, np.float32))
-        arguments = (*arrays, step_lengths, _CONSTANTS, *touched_by, self._steps, self._corrections, *clipped)
-        _raster.adam_rows(self.isa, rows, *arguments, operator.index(self.threads))
+        within = (gaussians.log_scales, gaussians.opacity_logits, least, np.array(limits, np.float32))
+        arguments = (*arrays, step_lengths, _CONSTANTS, *touched_by, self._steps, self._corrections, *within)
+        some = _ALL_ROWS if rows is None else rows, _ALL if chosen is None else chosen.view(np.uint8)
+        _raster.adam(self.isa, *some, *arguments, operator.index(self.threads))
 
 
 def _check_state(array: NDArray[np.generic], dtype: type[np.generic]) -> None:

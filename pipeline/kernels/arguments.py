@@ -210,6 +210,22 @@ def checked_image(
     return np.ascontiguousarray(image)
 
 
+def checked_bytes(name: str, image: object, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """A contiguous image of uint8.
+
+    Args:
+        name: of the argument, for the message.
+        image: as it was given.
+        shape: expected, that of the camera.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"{name} is {found}, expected an array of uint8, since there is a table")
+    if image.shape != shape:
+        raise ValueError(f"{name} has shape {image.shape}, expected {shape}, the size of the camera")
+    return np.ascontiguousarray(image)
+
+
 def refuse_bad_image(status: int, faults: dict[str, str]) -> None:
     """Refuse an image in which a kernel found what it cannot hold.
 

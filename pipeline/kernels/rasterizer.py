@@ -23,6 +23,7 @@ from duagc.pipeline.kernels.arguments import (
     check_type,
     check_wanted,
     checked_background,
+    checked_bytes,
     checked_camera,
     checked_exposure,
     checked_image,
@@ -129,7 +130,7 @@ class Rasterizer:
         camera: PinholeCamera,
         T_camera_map: ArrayLike,
         *,
-        color: Image,
+        color: Image | NDArray[np.uint8],
         depth_m: Image,
         loss: LossWeights,
         exposure: tuple[float, float] = (0.0, 0.0),
@@ -140,6 +141,7 @@ class Rasterizer:
         parameters: bool = True,
         depth_certainty: Image | None = None,
         closing: float = 0.0,
+        color_table: Image | None = None,
     ) -> tuple[ViewLoss, Gradients]:
         """Forward, loss and backward of one view in one pass: `splat.losses.rgbd_loss` and its derivatives.
 
@@ -153,7 +155,8 @@ class Rasterizer:
             gaussians: as in `forward`.
             camera: as in `forward`.
             T_camera_map: as in `forward`.
-            color: measured, float32 [H, W, 3], RGB 0..1, compared with exp(a) * rendered + b.
+            color: measured, float32 [H, W, 3], RGB 0..1, compared with exp(a) * rendered + b; or uint8 with
+                `color_table`.
             depth_m: measured, float32 [H, W], 0 where there is none.
             loss: weights of the terms.
             exposure: (a, b), log gain and offset of this image.
@@ -165,6 +168,7 @@ class Rasterizer:
             depth_certainty: factor [H, W] of the depth residuals, 0..1; None: all 1.
             closing: the Gaussian that takes the light of a pixel below this stops all that is left: about the same
                 image from fewer Gaussians. At most `TRANSMITTANCE_MIN`: as `forward` draws.
+            color_table: float32 [256, 3], the measured color by value of a channel in `color`; None: `color` is it.
         Returns:
             The loss with its terms, and the derivatives of its value.
         Raises:
@@ -173,10 +177,13 @@ class Rasterizer:
         height, width, view = self._view(
             gaussians, camera, T_camera_map, background=background, mask=mask, depth_kind=depth_kind
         )
-        measured = (
-            checked_image("color", color, (height, width, 3), "the camera"),
-            checked_image("depth_m", depth_m, (height, width), "the camera"),
-        )
+        depth_m = checked_image("depth_m", depth_m, (height, width), "the camera")
+        measured, optional = NOTHING, dict[str, NDArray[Any]]()
+        if color_table is None:
+            measured = checked_image("color", color, (height, width, 3), "the camera")
+        else:
+            optional["bytes"] = checked_bytes("color", color, (height, width, 3))
+            optional["of_bytes"] = checked_image("color_table", color_table, (256, 3), "a table of bytes")
         gain_and_offset = checked_exposure(exposure)
         check_type("loss", loss, LossWeights)
         of_images = loss.color_huber, loss.depth_weight, loss.depth_huber_m, loss.alpha_weight
@@ -184,11 +191,12 @@ class Rasterizer:
         weights = np.array([*of_images, *gain_and_offset, loss.surface_weight, closing], np.float32)
         out = outputs_for(gaussians, parameters)
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
-        arguments = [*arrays_of(gaussians), *view, *measured, weights, values, *out, by_pose]
+        arguments = [*arrays_of(gaussians), *view, measured, depth_m, weights, values, *out, by_pose]
         if depth_certainty is not None:
-            arguments.append(checked_image("depth_certainty", depth_certainty, (height, width), "the camera"))
+            size = height, width
+            optional["certainty"] = checked_image("depth_certainty", depth_certainty, size, "the camera")
         self._gaussians = None
-        status = self._raster.fit(*arguments)
+        status = self._raster.fit(*arguments, **optional)
         refuse_bad_image(status, {"color": NOT_FINITE, "depth_m": NEGATIVE, "depth_certainty": NEGATIVE})
         self._finish(gaussians, (height, width), status)
         self._closed_early = closing > TRANSMITTANCE_MIN

@@ -146,6 +146,7 @@ class ReferenceRasterizer:
         parameters: bool = True,
         depth_certainty: ArrayLike | None = None,
         closing: float = 0.0,
+        color_table: ArrayLike | None = None,
     ) -> tuple[ViewLoss, Gradients]:
         """Draw, compare with a measured image, differentiate; see `Rasterizer.view_gradients`."""
         import torch
@@ -153,6 +154,8 @@ class ReferenceRasterizer:
         self.forward(gaussians, camera, T_camera_map, background, depth_kind=depth_kind, mask=mask)
         if closing > TRANSMITTANCE_MIN:
             self._painting = paint(self._pixels, self._screen, self._background, closing)
+        if color_table is not None:
+            color = np.asarray(color_table)[np.asarray(color), np.arange(3)]
         certainty = np.ones(self._drawn.shape) if depth_certainty is None else depth_certainty
         rgb, z, sure = (tensor(np.asarray(image)[self._drawn]) for image in (color, depth_m, certainty))
         gain_and_offset = tensor(exposure).requires_grad_()

@@ -12,6 +12,7 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import DepthKind, LearningRates
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.exposure import by_table, unit_table
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels.adam import CompiledAdam
 from duagc.pipeline.kernels.moving_views import MovingViews
@@ -53,21 +54,23 @@ class TrainingView:
     """An RGB-D image as the loss takes it.
 
     Attributes:
-        color: float32 [H, W, 3], RGB in 0..1, or above where an exposure was taken back.
+        color: float32 [H, W, 3], RGB in 0..1, or above where an exposure was taken back; or uint8, by `color_table`.
         depth_m: float32 [H, W], meters, 0 where nothing was measured.
         T_map_camera: [4, 4], pose of the camera in the frame of the Gaussians.
         mask: bool [H, W], pixels that count; None: all.
         depth_certainty: float32 [H, W], factor of the depth residuals (`splat.losses.depth_certainty`); None: 1.
         T_camera_moment: [k, 4, 4], k odd: where the camera is while its shutter is open, seen from the middle; None: it
             stands still.
+        color_table: float32 [256, 3], color by value of a channel; None: the color is what it says.
     """
 
-    color: Image
+    color: Image | NDArray[np.uint8]
     depth_m: Image
     T_map_camera: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
     depth_certainty: Image | None = None
     T_camera_moment: NDArray[np.float64] | None = None
+    color_table: Image | None = None
 
     @classmethod
     def of(cls, view: PosedRgbd, loss: DepthTrust) -> TrainingView:
@@ -79,8 +82,21 @@ class TrainingView:
         """
         certainty = depth_certainty(view.depth_m, view.depth_sigma_m, loss)
         return cls(
-            view.unit_color, view.depth_m, view.T_world_camera, view.mask, certainty, view.T_camera_moment
+            view.color,
+            view.depth_m,
+            view.T_world_camera,
+            view.mask,
+            certainty,
+            view.T_camera_moment,
+            color_table=unit_table(view.exposure),
         )
+
+    @property
+    def shown_color(self) -> Image:
+        """float32 [H, W, 3], RGB in 0..1 and above."""
+        if self.color_table is None:
+            return np.asarray(self.color, np.float32)
+        return by_table(np.asarray(self.color, np.uint8), self.color_table)
 
 
 @dataclass(frozen=True)
@@ -137,7 +153,7 @@ class TrainingStep:
                 camera,
                 view.T_map_camera,
                 view.T_camera_moment,
-                color=view.color,
+                color=view.shown_color,
                 depth_m=view.depth_m,
                 loss=self.loss,
                 mask=view.mask,
@@ -151,6 +167,7 @@ class TrainingStep:
             camera,
             se3.inverse(view.T_map_camera),
             color=view.color,
+            color_table=view.color_table,
             depth_m=view.depth_m,
             loss=self.loss,
             mask=view.mask,
@@ -161,76 +178,28 @@ class TrainingStep:
             parameters=parameters,
         )
 
-    def __call__(
-        self,
-        gaussians: Gaussians,
-        camera: PinholeCamera,
-        view: TrainingView,
-        *,
-        adam: CompiledAdam,
-        rates: LearningRates,
-        limits: ScaleLimits,
-        closing: float = 0.0,
-    ) -> tuple[Gaussians, ViewLoss]:
-        """The Gaussians after one step of Adam on one view, and the loss before it.
 
-        Args:
-            gaussians: as many as `adam` has a state of.
-            camera: of the view.
-            view: an image with its pose in the frame of the Gaussians.
-            adam: state of the optimization; changed.
-            rates: step lengths.
-            limits: of the log-scales.
-            closing: as of `Rasterizer.view_gradients`.
-        """
-        loss, gradients = self.gradients(gaussians, camera, view, closing=closing)
-        return self.stepped(gaussians, gradients, adam=adam, rates=rates, limits=limits), loss
-
-    @staticmethod
-    def stepped(
-        gaussians: Gaussians,
-        gradients: Gradients,
-        *,
-        adam: CompiledAdam,
-        rates: LearningRates,
-        limits: ScaleLimits,
-    ) -> Gaussians:
-        """The Gaussians after one step of Adam, within their limits.
-
-        Args:
-            gaussians: as many as `adam` has a state of.
-            gradients: of the loss by them.
-            adam: state of the optimization; changed.
-            rates: step lengths.
-            limits: of the log-scales.
-        """
-        stepped = adam.step(gaussians, gradients, rates)
-        logit = np.float32(LARGEST_LOGIT)
-        return stepped.replace(
-            log_scales=np.clip(stepped.log_scales, limits.least, limits.greatest),
-            opacity_logits=np.clip(stepped.opacity_logits, -logit, logit),
-        )
-
-
-def step_rows(
+def step_in_place(
     gaussians: Gaussians,
     adam: CompiledAdam,
-    rows: NDArray[np.int64],
-    *,
     gradients: Gradients,
+    *,
     rates: LearningRates,
     limits: ScaleLimits,
+    rows: NDArray[np.int64] | None = None,
+    chosen: NDArray[np.bool_] | None = None,
 ) -> None:
-    """`TrainingStep.stepped` of some Gaussians in place; none is copied.
+    """One step of Adam of Gaussians in place, within their limits; none is copied.
 
     Args:
         gaussians: of which some are changed.
         adam: state of the optimization of all of them; changed.
-        rows: [m], which, each once.
-        gradients: [m], of the loss by these.
+        gradients: [m], of the loss by those of the rows.
         rates: step lengths.
         limits: of the log-scales.
+        rows: [m], which, each once; None: all.
+        chosen: [n], which may change; None: all.
     """
     least = np.atleast_1d(np.asarray(limits.least, np.float32))
     of_all = (float(limits.greatest), LARGEST_LOGIT)
-    adam.step_rows(gaussians, rows, gradients, rates, least=least, limits=of_all)
+    adam.step_in_place(gaussians, gradients, rates, least=least, limits=of_all, rows=rows, chosen=chosen)

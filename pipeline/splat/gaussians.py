@@ -71,6 +71,10 @@ class Gaussians:
         """
         return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    def copy(self) -> Gaussians:
+        """The same in arrays of its own, which may be changed."""
+        return Gaussians(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
     def replace(self, **arrays: Any) -> Gaussians:
         """Exchange some arrays.
 

@@ -20,7 +20,7 @@ from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.exposure import Exposure, ExposureTrack, unit_color, unit_table
+from duagc.pipeline.geometry.exposure import Exposure, ExposureTrack, by_table, unit_color, unit_table
 from duagc.pipeline.information.stage import run_information
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.recording import RgbdFrame, read_exposures, read_log
@@ -272,7 +272,9 @@ def test_what_a_training_takes_of_an_image_is_the_image_in_the_colors_of_the_map
         Exposure(np.array([0.8, 1.0, 1.3]), np.array([0.02, 0.0, -0.03]), np.ones(3)) if exposed else None
     )
     color, alpha = random.integers(0, 256, (6, 8, 3), np.uint8), random.random((6, 8), np.float32)
-    assert np.array_equal(unit_table(exposure)[color, np.arange(3)], unit_color(color, exposure))
+    table = unit_table(exposure)
+    assert np.array_equal(table[color, np.arange(3)], unit_color(color, exposure))
+    assert np.array_equal(by_table(color, table), unit_color(color, exposure))
     if exposure is not None:
         planes = np.ascontiguousarray(np.moveaxis(unit_color(color, exposure), -1, 0))
         by_plane = exposure.planes_in_image(planes, alpha)

@@ -14,7 +14,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.geometry.view_extent import ViewExtent
-from duagc.pipeline.kernels import CompiledAdam, Gradients, LossWeights, Rasterizer
+from duagc.pipeline.kernels import LossWeights, Rasterizer
 from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from tests.frontend.test_mapping import CAMERA, POSES, QUICK, drawn, same, shot
@@ -174,16 +174,13 @@ def test_a_step_of_what_a_view_sees_is_that_of_all(keep_guests: bool) -> None:
     seen = np.flatnonzero((step.gradients(part.gaussians, CAMERA, view)[1].colors[:count] != 0).any(axis=1))
     assert 0 < len(seen) < count < len(part)
 
-    def take(gradients: Gradients, gaussians: Gaussians, adam: CompiledAdam) -> Gaussians:
-        return step.stepped(gaussians, gradients, adam=adam, rates=config.rates, limits=limits)
-
     for _ in range(3):
         _, gradients = step.gradients(part.seen_with(seen), CAMERA, view)
         part.step(seen, gradients, config.rates, limits=limits, keep_guests=keep_guests)
         _, gradients = step.gradients(maps[1].gaussians, CAMERA, view)
         for array in (gradients.colors, gradients.opacity_logits):
             array[: count if keep_guests else 0] = 0
-        maps[1].gaussians = take(gradients, maps[1].gaussians, maps[1].adam)
+        maps[1].step_all(gradients, config.rates, limits=limits)
     assert same(part.gaussians, maps[1].gaussians)
     assert all(np.array_equal(a, b) for a, b in zip(*(m.adam.state()[1].values() for m in maps), strict=True))
     begun = take_tile(_grown(2), [1], _sights([1]), []).gaussians

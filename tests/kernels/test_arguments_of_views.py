@@ -38,6 +38,27 @@ def differentiated(**changes: object):
     return Rasterizer().view_gradients(**{**arguments, **changes})
 
 
+BYTES = np.ones((*SHAPE, 3), np.uint8)
+TABLE = ones(3)[:1, :1].repeat(256, axis=0)[:, 0]
+
+
+@pytest.mark.parametrize(
+    ("color", "table", "words"),
+    [
+        (ones(3), TABLE, "color is float32, expected an array of uint8"),
+        (BYTES[1:], TABLE, r"color has shape .*, expected \(10, 20, 3\)"),
+        (BYTES, TABLE[1:], r"color_table has shape \(255, 3\), expected \(256, 3\)"),
+        (BYTES, TABLE.astype(np.float64), "color_table is float64"),
+        (BYTES, None, "color is uint8, expected an array of float32"),
+        (BYTES, np.inf * TABLE, "color"),
+    ],
+)
+def test_images_of_bytes_that_cannot_be(color, table, words):
+    assert np.isfinite(differentiated(color=BYTES, color_table=TABLE)[0].value)
+    with pytest.raises(REFUSED, match=words):
+        differentiated(color=color, color_table=table)
+
+
 MASKS = {
     "transposed": np.ones(SHAPE[::-1], bool),
     "short": np.ones((9, 20), bool),

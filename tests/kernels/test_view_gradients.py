@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.kernels import Rasterizer, available_isas
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
 from duagc.pipeline.kernels.types import Gradients
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS
@@ -70,6 +70,28 @@ def test_view_gradients_are_forward_loss_and_backward(rasterizer, scene, exposur
                 change = np.linalg.norm(getattr(other, name) - getattr(separate, name))
                 drift[name] = max(drift[name], 2 * change)
     assert_same_gradients(gradients, separate, 1e-5, drift)
+
+
+@pytest.mark.parametrize("isa", available_isas())
+@pytest.mark.parametrize("masked", [False, True])
+def test_an_image_of_bytes_is_that_which_its_table_makes_of_it(plain, isa, masked):
+    random = np.random.default_rng(3)
+    _, depth_m = measured_images(plain)
+    table = random.uniform(-0.1, 1.4, (256, 3)).astype(np.float32)
+    seen = random.integers(0, 256, (*depth_m.shape, 3), np.uint8)
+    view = plain.gaussians, plain.camera, plain.T_camera_map
+    options = {
+        "depth_m": depth_m,
+        "loss": LOSS,
+        "mask": checkerboard(plain) if masked else None,
+        "pose": True,
+    }
+    for rasterizer, same in ((Rasterizer(isa, 2), np.array_equal), (ReferenceRasterizer(), np.array_equal)):
+        loss, gradients = rasterizer.view_gradients(*view, color=seen, color_table=table, **options)
+        color = table[seen, np.arange(3)]
+        wanted, of_color = rasterizer.view_gradients(*view, color=color, **options)
+        assert loss == wanted
+        assert all(same(a, b) for a, b in zip(vars(gradients).values(), vars(of_color).values(), strict=True))
 
 
 def test_view_gradients_with_certain_depth_are_those_without(plain):

@@ -8,7 +8,7 @@ import pytest
 
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.kernels import CompiledAdam, Gradients, available_isas
-from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, step_rows
+from duagc.pipeline.kernels.training import ScaleLimits, step_in_place
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, Adam, sizes, smoothstep_decay
 
@@ -192,39 +192,65 @@ def test_rates_fall_from_one_to_the_last_and_never_rise() -> None:
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("isa", available_isas())
 @pytest.mark.parametrize("of_each", [False, True])
-def test_a_step_of_rows_in_place_is_that_of_all(threads: int, isa: str, of_each: bool) -> None:
-    n = 400
+@pytest.mark.parametrize("some_rows", [False, True])
+@pytest.mark.parametrize("some_chosen", [False, True])
+def test_a_step_in_place_is_the_plain_one_within_limits(
+    threads: int, isa: str, of_each: bool, some_rows: bool, some_chosen: bool
+) -> None:
+    n = 401
     random = np.random.default_rng(2)
-    least = np.float32(-1.5) if not of_each else random.uniform(-2, -1, (n, 3)).astype(np.float32)
-    whole, rows = some(n), random.permutation(n)[:231]
-    whole = whole.replace(opacity_logits=np.where(rows[7] == np.arange(n), 9, whole.opacity_logits))
-    parts, adam, of_parts = whole.select(np.arange(n)), CompiledAdam(n, isa), CompiledAdam(n, isa, threads)
+    least = random.uniform(-2, -1, (n, 3)).astype(np.float32) if of_each else np.float32(-1.5)
+    limits = ScaleLimits(least, np.float32(1.5))
+    rows = random.permutation(n)[:231] if some_rows else np.arange(n)
+    chosen = random.random(n) < 0.6 if some_chosen else np.ones(n, bool)
+    begun = some(n)
+    begun = begun.replace(opacity_logits=np.where(random.random(n) < 0.1, 9, begun.opacity_logits))
+    expected, plain, found, adam = begun, Adam(n), begun.copy(), CompiledAdam(n, isa, threads)
+    changed = np.isin(np.arange(n), rows) & chosen
     for k in range(3):
         g = gradients(n, k)
         untouched = random.random(n) < 0.3
+        untouched[200:240] = True  # whole groups of the kernel
         for array in (g.colors, g.opacity_logits):
             array[untouched] = 0
-        taken = CompiledAdam(isa=isa)
-        taken.go_on(adam.state())
-        taken.select(rows)
-        limits = ScaleLimits(least[rows] if of_each else least, np.float32(1.5))
-        stepped = TrainingStep.stepped(
-            whole.select(rows), g.of_rows(rows), adam=taken, rates=LearningRates(), limits=limits
+        of_changed = Gradients(
+            *(
+                np.where(changed.reshape(-1, *[1] * (x.ndim - 1)), x, 0)
+                for x in (getattr(g, m) for m in NAMES)
+            )
+        )
+        stepped = plain.step(expected, of_changed, LearningRates())
+        scales = np.clip(stepped.log_scales, least, limits.greatest)
+        expected = stepped.replace(
+            log_scales=np.where(changed[:, None], scales, stepped.log_scales),
+            opacity_logits=np.where(changed, np.clip(stepped.opacity_logits, -6, 6), stepped.opacity_logits),
+        )
+        step_in_place(
+            found,
+            adam,
+            g.of_rows(rows),
+            rates=LearningRates(),
+            limits=limits,
+            rows=rows if some_rows else None,
+            chosen=chosen if some_chosen else None,
         )
         for name in NAMES:
-            getattr(whole, name)[rows] = getattr(stepped, name)
-            for of, state in zip(adam.state()[:2], taken.state()[:2], strict=True):
-                of[name][rows] = state[name]
-        adam.state()[2][rows] = taken.state()[2]
-        limits = ScaleLimits(least, np.float32(1.5))
-        step_rows(parts, of_parts, rows, gradients=g.of_rows(rows), rates=LearningRates(), limits=limits)
-        for name in NAMES:
-            assert np.array_equal(getattr(parts, name), getattr(whole, name))
-            for a, b in zip(of_parts.state()[:2], adam.state()[:2], strict=True):
+            assert np.array_equal(getattr(found, name), getattr(expected, name))
+            for a, b in zip(adam.state()[:2], plain.state()[:2], strict=True):
                 assert np.array_equal(a[name], b[name])
-        assert np.array_equal(of_parts.state()[2], adam.state()[2])
-    assert np.abs(parts.opacity_logits[rows]).max() <= 6
-    assert (parts.log_scales[rows] <= 1.5).all()
+        assert np.array_equal(adam.state()[2], plain.state()[2])
+    assert np.abs(found.opacity_logits[changed]).max() <= 6
+    assert (found.log_scales[changed] <= 1.5).all()
+    for name in NAMES:
+        assert np.array_equal(getattr(found, name)[~changed], getattr(begun, name)[~changed])
+
+
+def test_a_step_of_no_row_changes_nothing() -> None:
+    gaussians, adam, none = some(6), CompiledAdam(6), np.zeros(0, np.int64)
+    g, limits = gradients(6, 0).of_rows(none), ScaleLimits(np.float32(-0.1))
+    before = gaussians.copy()
+    step_in_place(gaussians, adam, g, rates=LearningRates(), limits=limits, rows=none)
+    assert all(np.array_equal(getattr(gaussians, name), getattr(before, name)) for name in NAMES)
 
 
 @pytest.mark.parametrize(
@@ -234,13 +260,22 @@ def test_a_step_of_rows_in_place_is_that_of_all(threads: int, isa: str, of_each:
 def test_rows_that_are_none_are_refused(rows: list[int], message: str) -> None:
     limits = ScaleLimits(np.float32(-7))
     with pytest.raises(ValueError, match=message):
-        step_rows(
+        step_in_place(
             some(6),
             CompiledAdam(6),
-            np.array(rows),
-            gradients=gradients(2, 0),
+            gradients(2, 0),
             rates=LearningRates(),
             limits=limits,
+            rows=np.array(rows),
+        )
+
+
+@pytest.mark.parametrize("chosen", [np.ones(5, bool), np.ones(6, np.uint8)])
+def test_a_choice_that_is_none_is_refused(chosen: np.ndarray) -> None:
+    limits = ScaleLimits(np.float32(-7))
+    with pytest.raises(ValueError, match=r"chosen is .*, expected bool \(6,\)"):
+        step_in_place(
+            some(6), CompiledAdam(6), gradients(6, 0), rates=LearningRates(), limits=limits, chosen=chosen
         )
 
 

@@ -1,4 +1,4 @@
-// One step of Adam (splat.optimizer.Adam, the same bits): every element goes its own way.
+// One step of Adam (splat.optimizer.Adam, the same bits), in place: every element goes its own way.
 #pragma once
 
 #include "frame.h"
@@ -10,14 +10,32 @@ using namespace raster;
 
 constexpr size_t ADAM_ROWS = 16;  // Gaussians at a time: often none of so few was touched
 
+// The bits of a number but its sign: zero for zeros of both signs alone.
+inline uint32_t magnitude(const float* value) {
+    uint32_t bits;
+    __builtin_memcpy(&bits, value, sizeof bits);
+    return bits << 1;
+}
+
+// Whether the view touched none of some Gaussians; most views touch few.
+inline bool untouched(const AdamStep& step, size_t begin, size_t end) {
+    uint32_t any = 0;
+    for (size_t i = begin; i < end; i++) any |= magnitude(step.d_opacity_logits + i);
+    for (size_t i = 3 * begin; i < 3 * end; i++) any |= magnitude(step.d_colors + i);
+    return any == 0;
+}
+
 // Counts the step of every Gaussian that the view touched; its bias correction, or 0 if it was not touched.
-inline bool count_steps(const AdamStep& step, const int64_t* rows, size_t begin, size_t end, float* correction) {
+inline bool count_steps(const AdamStep& step, size_t begin, size_t end, float* correction) {
+    if (untouched(step, begin, end)) return false;
     bool any = false;
     for (size_t row = begin; row < end; row++) {
         const float* color = step.d_colors + 3 * row;
-        const bool touched = step.d_opacity_logits[row] != 0.0f || color[0] != 0.0f || color[1] != 0.0f || color[2] != 0.0f;
-        int32_t& count = step.steps[rows ? rows[row] : static_cast<int64_t>(row)];
-        if (touched && count < step.longest) count++;
+        const size_t at = step.row(row);
+        const uint32_t gradient = magnitude(step.d_opacity_logits + row) | magnitude(color) | magnitude(color + 1) | magnitude(color + 2);
+        const bool touched = gradient != 0 && (!step.chosen || step.chosen[at]);
+        int32_t& count = step.steps[at];
+        count += touched && count < step.longest;
         correction[row - begin] = touched ? step.corrections[count - 1] : 0.0f;
         any |= touched;
     }
@@ -38,11 +56,9 @@ inline float size_of(const float* log_scales) {
 }
 
 // Corrections of parameters whose rate is a share of the Gaussian's size.
-inline void times_sizes(const AdamStep& step, const int64_t* rows, size_t begin, size_t end, const float* correction, float* of_size) {
-    for (size_t row = begin; row < end; row++) {
-        const size_t at = rows ? static_cast<size_t>(rows[row]) : row;
-        of_size[row - begin] = correction[row - begin] * size_of(step.log_scales + 3 * at);
-    }
+inline void times_sizes(const AdamStep& step, size_t begin, size_t end, const float* correction, float* of_size) {
+    for (size_t row = begin; row < end; row++)
+        of_size[row - begin] = correction[row - begin] * size_of(step.log_scales + 3 * step.row(row));
 }
 
 // Source: Kingma and Ba, ICLR 2015, algorithm 1. A function of its own, so that the compiler sees arrays that do not overlap
@@ -64,37 +80,14 @@ NO_INLINE static void step_elements(size_t count, const AdamConstants& constants
 }
 
 template <size_t WIDTH>
-inline void step_array(const AdamArray& array, const AdamConstants& constants, size_t begin, size_t end, const float* correction) {
-    float of_element[ADAM_ROWS * WIDTH];
+inline void step_all(const AdamArray& array, const AdamConstants& constants, size_t begin, size_t end, const float* correction) {
+    float of_element[ADAM_ROWS * WIDTH], out[ADAM_ROWS * WIDTH];
     for (size_t row = 0; row < end - begin; row++)
         for (size_t k = 0; k < WIDTH; k++) of_element[row * WIDTH + k] = correction[row];
-    const size_t start = begin * WIDTH;
-    step_elements((end - begin) * WIDTH, constants, array.rate, of_element, array.values + start, array.gradients + start,
-                  array.first + start, array.second + start, array.out + start);
-}
-
-static void adam(const AdamStep& step, int threads) {
-    const int groups = static_cast<int>((step.count + ADAM_ROWS - 1) / ADAM_ROWS);
-#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
-    for (int group = 0; group < groups; group++) {
-        const size_t begin = static_cast<size_t>(group) * ADAM_ROWS;
-        const size_t end = begin + ADAM_ROWS < step.count ? begin + ADAM_ROWS : step.count;
-        float correction[ADAM_ROWS], of_size[ADAM_ROWS];
-        const bool any = count_steps(step, nullptr, begin, end, correction);
-        if (any) times_sizes(step, nullptr, begin, end, correction, of_size);
-        for (const AdamArray& array : step.arrays) {
-            const float* factors = array.of_size ? of_size : correction;
-            if (!any)
-                __builtin_memcpy(array.out + begin * array.width, array.values + begin * array.width,
-                                 (end - begin) * array.width * sizeof(float));
-            else if (array.width == 1)
-                step_array<1>(array, step.constants, begin, end, factors);
-            else if (array.width == 3)
-                step_array<3>(array, step.constants, begin, end, factors);
-            else
-                step_array<4>(array, step.constants, begin, end, factors);
-        }
-    }
+    const size_t start = begin * WIDTH, count = (end - begin) * WIDTH;
+    step_elements(count, constants, array.rate, of_element, array.values + start, array.gradients + start, array.first + start,
+                  array.second + start, out);
+    __builtin_memcpy(array.values + start, out, count * sizeof(float));
 }
 
 template <size_t WIDTH>
@@ -114,42 +107,69 @@ inline void step_rows(const AdamArray& array, const AdamConstants& constants, co
     for (size_t row = begin; row < end; row++) {
         const size_t to = static_cast<size_t>(rows[row]) * WIDTH, from = (row - begin) * WIDTH;
         for (size_t k = 0; k < WIDTH; k++) {
-            array.out[to + k] = out[from + k];
+            array.values[to + k] = out[from + k];
             array.first[to + k] = first[from + k], array.second[to + k] = second[from + k];
         }
     }
+}
+
+template <size_t WIDTH>
+inline void step_some(const AdamArray& array, const AdamConstants& constants, const int64_t* rows, size_t begin, size_t end,
+                      const float* correction) {
+    if (rows)
+        step_rows<WIDTH>(array, constants, rows, begin, end, correction);
+    else
+        step_all<WIDTH>(array, constants, begin, end, correction);
 }
 
 inline float clipped(float value, float least, float greatest) {
     return value < least ? least : value > greatest ? greatest : value;
 }
 
-static void adam_rows(const AdamStep& step, const AdamRows& some, int threads) {
+// Puts what is beyond the limits there; vectors where all Gaussians are meant.
+inline void limit(const AdamStep& step, const AdamLimits& limits, size_t begin, size_t end) {
+    const float greatest = limits.greatest, logit = limits.largest_logit;
+    if (step.rows || step.chosen) {
+        for (size_t row = begin; row < end; row++) {
+            const size_t at = step.row(row);
+            if (step.chosen && !step.chosen[at]) continue;
+            float* scales = limits.log_scales + 3 * at;
+            for (size_t k = 0; k < 3; k++)
+                scales[k] = clipped(scales[k], limits.least_of_each ? limits.least[3 * at + k] : limits.least[0], greatest);
+            limits.opacity_logits[at] = clipped(limits.opacity_logits[at], -logit, logit);
+        }
+        return;
+    }
+    float *scales = limits.log_scales, *logits = limits.opacity_logits;
+    const float *least = limits.least, least_of_all = limits.least[0];
+    if (limits.least_of_each)
+        for (size_t i = 3 * begin; i < 3 * end; i++) scales[i] = clipped(scales[i], least[i], greatest);
+    else
+        for (size_t i = 3 * begin; i < 3 * end; i++) scales[i] = clipped(scales[i], least_of_all, greatest);
+    for (size_t i = begin; i < end; i++) logits[i] = clipped(logits[i], -logit, logit);
+}
+
+// What has no row in `rows` or is not chosen stays as it is.
+static void adam(const AdamStep& step, const AdamLimits& limits, int threads) {
     const int groups = static_cast<int>((step.count + ADAM_ROWS - 1) / ADAM_ROWS);
 #pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
     for (int group = 0; group < groups; group++) {
         const size_t begin = static_cast<size_t>(group) * ADAM_ROWS;
         const size_t end = begin + ADAM_ROWS < step.count ? begin + ADAM_ROWS : step.count;
         float correction[ADAM_ROWS], of_size[ADAM_ROWS];
-        if (count_steps(step, some.rows, begin, end, correction)) {
-            times_sizes(step, some.rows, begin, end, correction, of_size);  // before log-scales change
+        if (count_steps(step, begin, end, correction)) {
+            times_sizes(step, begin, end, correction, of_size);  // before log-scales change
             for (const AdamArray& array : step.arrays) {
                 const float* factors = array.of_size ? of_size : correction;
                 if (array.width == 1)
-                    step_rows<1>(array, step.constants, some.rows, begin, end, factors);
+                    step_some<1>(array, step.constants, step.rows, begin, end, factors);
                 else if (array.width == 3)
-                    step_rows<3>(array, step.constants, some.rows, begin, end, factors);
+                    step_some<3>(array, step.constants, step.rows, begin, end, factors);
                 else
-                    step_rows<4>(array, step.constants, some.rows, begin, end, factors);
+                    step_some<4>(array, step.constants, step.rows, begin, end, factors);
             }
         }
-        for (size_t row = begin; row < end; row++) {
-            const size_t at = static_cast<size_t>(some.rows[row]);
-            float &logit = some.opacity_logits[at], *scales = some.log_scales + 3 * at;
-            for (size_t k = 0; k < 3; k++)
-                scales[k] = clipped(scales[k], some.least_of_each ? some.least[3 * at + k] : some.least[0], some.greatest);
-            logit = clipped(logit, -some.largest_logit, some.largest_logit);
-        }
+        limit(step, limits, begin, end);
     }
 }
 

@@ -112,7 +112,8 @@ inline void fetch_ahead(const Frame& frame, int index, int part, const Loss& los
         for (; from < to; from += 64 / sizeof(float)) __builtin_prefetch(from);
         __builtin_prefetch(to - 1);
     };
-    fetch(loss.color + 3 * begin, loss.color + 3 * end);
+    if (loss.color) fetch(loss.color + 3 * begin, loss.color + 3 * end);
+    else __builtin_prefetch(loss.bytes + 3 * begin);
     fetch(loss.depth_m + begin, loss.depth_m + end);
     if (loss.certainty) fetch(loss.certainty + begin, loss.certainty + end);
 }
@@ -143,8 +144,9 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
     for (int b = 0; b < BLOCKS; b++) {
         const Block block(sweep.tile, b, view);
         if (block.outside(view)) continue;
-        Vec rgb[3];
-        read_block_rgb(loss.color, block, view, rgb);
+        Vec rgb[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
+        if (loss.color) read_block_rgb(loss.color, block, view, rgb);
+        else if (block.wanted(view)) read_block_rgb(loss.bytes, loss.of_bytes, block, view, rgb);
         const Vec z = read_block(loss.depth_m, block, view);
         bad[0] |= !(finite(rgb[0]) && finite(rgb[1]) && finite(rgb[2]));
         bad[1] |= !finite_not_negative(z);

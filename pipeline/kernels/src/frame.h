@@ -199,6 +199,8 @@ struct FisherArrays {
 // The loss of a view against the measured color [h, w, 3] and depth [h, w], meters, 0 where there is none.
 struct Loss {
     const float *color, *depth_m;
+    const uint8_t* bytes;    // [h, w, 3], the image in the place of color, which is null
+    const float* of_bytes;   // [256, 3], color by value of a channel
     const float* certainty;  // factor of the residuals of depth, per pixel; null: 1
     float color_huber, depth_weight, depth_huber_m, alpha_weight, surface_weight;
     float gain, offset;  // of the exposure: the image is about gain * rendered + offset
@@ -209,33 +211,35 @@ struct LossValues {
     double color, depth, missing_alpha, by_log_gain, by_offset, surface;  // means over their pixels
 };
 
-// One step of Adam: all parameters of one kind, [count, width] each.
+// One step of Adam, in place: all parameters of one kind.
 struct AdamArray {
-    const float *values, *gradients;
-    float *first, *second;  // moments
-    float* out;             // the values after the step
+    float* values;           // [n, width], as the moments
+    const float* gradients;  // [count, width]
+    float *first, *second;   // moments
     float rate;
-    size_t width;           // 1, 3 or 4
-    bool of_size;           // the rate is a share of the Gaussian's size
+    size_t width;            // 1, 3 or 4
+    bool of_size;            // the rate is a share of the Gaussian's size
 };
 struct AdamConstants {
     float beta_1, rest_1, beta_2, rest_2, epsilon;  // rest = 1 - beta
 };
 struct AdamStep {
     size_t count;
+    const int64_t* rows;    // [count], each once: the Gaussians that have gradients; null: all n
+    const uint8_t* chosen;  // [n], which may change; null: all
     AdamArray arrays[5];
     AdamConstants constants;
-    const float* log_scales;                   // of all Gaussians, before the step
+    const float* log_scales;                   // [n, 3], before the step
     const float *d_colors, *d_opacity_logits;  // zero where the view did not touch a Gaussian
-    int32_t* steps;                            // [count], those taken so far, at most `longest`
+    int32_t* steps;                            // [n], those taken so far, at most `longest`
     const float* corrections;                  // [longest], of the bias after 1, 2, ... steps
     int32_t longest;
+
+    size_t row(size_t at) const { return rows ? static_cast<size_t>(rows[at]) : at; }
 };
-// Of a step of some rows, in place.
-struct AdamRows {
-    const int64_t* rows;  // [count], each once; gradients have a row for each, everything else those of all Gaussians
-    float *log_scales, *opacity_logits;
-    const float* least;   // of the log-scales: of each Gaussian [n, 3], or one
+struct AdamLimits {
+    float *log_scales, *opacity_logits;  // [n, 3], [n]
+    const float* least;                  // of the log-scales: of each Gaussian [n, 3], or one
     bool least_of_each;
     float greatest, largest_logit;
 };
@@ -263,8 +267,7 @@ struct Kernels {
     // information: [n, 14, 14]
     Status (*full_fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, double* information);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);
-    void (*adam)(const AdamStep&, int threads);
-    void (*adam_rows)(const AdamStep&, const AdamRows&, int threads);
+    void (*adam)(const AdamStep&, const AdamLimits&, int threads);
     double (*fma_rate)(int threads, double seconds);                              // of the machine, GFLOP/s
     void (*bandwidth)(int threads, double seconds, double* read, double* copied);  // GB/s
 };

@@ -175,6 +175,5 @@ extern const RegistrationKernels REGISTRATION_TABLE;
 extern const Kernels KERNEL_TABLE;
 const Kernels KERNEL_TABLE = {AS_TEXT(KERNEL_ISA), &REGISTRATION_TABLE, KERNEL_ISA::forward, KERNEL_ISA::backward, KERNEL_ISA::fisher,
                               KERNEL_ISA::opacity_information, KERNEL_ISA::contributions, KERNEL_ISA::layer_depth, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam,
-                              KERNEL_ISA::adam_rows,
                               KERNEL_ISA::fma_rate, KERNEL_ISA::bandwidth};
 }  // namespace raster

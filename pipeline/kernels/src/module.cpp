@@ -82,49 +82,31 @@ static nb::tuple bandwidth(int threads, double seconds) {
 
 constexpr size_t MEANS = 0, LOG_SCALES = 2;  // among the kinds of parameters
 
-static AdamStep adam_step(const std::vector<Inputs>& gradients, const std::vector<Floats>& first, const std::vector<Floats>& second,
-                          const Inputs& rates, const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits,
-                          const Array<int32_t>& steps, const Inputs& corrections) {
+// Shapes are checked by pipeline.kernels.adam, the only caller. The lists have an array for each kind of parameter; rows and
+// chosen may be empty; limits: the greatest log-scale, and the largest opacity logit.
+static void adam(const std::string& isa, const Array<const int64_t>& rows, const Array<const uint8_t>& chosen,
+                 const std::vector<Floats>& values, const std::vector<Inputs>& gradients, const std::vector<Floats>& first,
+                 const std::vector<Floats>& second, const Inputs& rates, const Inputs& constants, const Inputs& d_colors,
+                 const Inputs& d_logits, const Array<int32_t>& steps, const Inputs& corrections, const Floats& log_scales,
+                 const Floats& opacity_logits, const Inputs& least, const Inputs& limits, int threads) {
     AdamStep step;
     step.count = d_logits.shape(0);
+    step.rows = rows.size() ? rows.data() : nullptr;
+    step.chosen = chosen.size() ? chosen.data() : nullptr;
     for (size_t k = 0; k < std::size(step.arrays); k++)
-        step.arrays[k] = {nullptr, gradients[k].data(), first[k].data(), second[k].data(), nullptr, rates.data()[k],
-                          gradients[k].ndim() > 1 ? gradients[k].shape(1) : 1, k == MEANS};
+        step.arrays[k] = {values[k].data(), gradients[k].data(), first[k].data(),
+                          second[k].data(), rates.data()[k],     gradients[k].ndim() > 1 ? gradients[k].shape(1) : 1,
+                          k == MEANS};
     const float* c = constants.data();
     step.constants = {c[0], c[1], c[2], c[3], c[4]};
+    step.log_scales = values[LOG_SCALES].data();
     step.d_colors = d_colors.data(), step.d_opacity_logits = d_logits.data();
     step.steps = steps.data(), step.corrections = corrections.data(), step.longest = static_cast<int32_t>(corrections.size());
-    return step;
-}
-
-// Shapes are checked by pipeline.kernels.adam, the only caller. The lists have an array for each kind of parameter.
-static void adam(const std::string& isa, const std::vector<Inputs>& values, const std::vector<Inputs>& gradients,
-                 const std::vector<Floats>& first, const std::vector<Floats>& second, const std::vector<Floats>& out, const Inputs& rates,
-                 const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits, const Array<int32_t>& steps,
-                 const Inputs& corrections, int threads) {
-    AdamStep step = adam_step(gradients, first, second, rates, constants, d_colors, d_logits, steps, corrections);
-    for (size_t k = 0; k < std::size(step.arrays); k++)
-        step.arrays[k].values = values[k].data(), step.arrays[k].out = out[k].data();
-    step.log_scales = values[LOG_SCALES].data();
+    const AdamLimits within = {log_scales.data(),  opacity_logits.data(), least.data(),
+                               least.size() > 1, limits.data()[0],     limits.data()[1]};
     const Kernels* kernels = kernels_named(isa);
     const nb::gil_scoped_release unlocked;
-    kernels->adam(step, threads);
-}
-
-// Likewise of some rows, in place. limits: the greatest log-scale, and the largest opacity logit.
-static void adam_rows(const std::string& isa, const Array<const int64_t>& rows, const std::vector<Floats>& values,
-                      const std::vector<Inputs>& gradients, const std::vector<Floats>& first, const std::vector<Floats>& second,
-                      const Inputs& rates, const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits,
-                      const Array<int32_t>& steps, const Inputs& corrections, const Floats& log_scales, const Floats& opacity_logits,
-                      const Inputs& least, const Inputs& limits, int threads) {
-    AdamStep step = adam_step(gradients, first, second, rates, constants, d_colors, d_logits, steps, corrections);
-    for (size_t k = 0; k < std::size(step.arrays); k++) step.arrays[k].values = step.arrays[k].out = values[k].data();
-    step.log_scales = values[LOG_SCALES].data();
-    const AdamRows some = {rows.data(),     log_scales.data(), opacity_logits.data(), least.data(),
-                           least.size() > 1, limits.data()[0],  limits.data()[1]};
-    const Kernels* kernels = kernels_named(isa);
-    const nb::gil_scoped_release unlocked;
-    kernels->adam_rows(step, some, threads);
+    kernels->adam(step, within, threads);
 }
 
 // Shapes and ranges are checked by pipeline.kernels.rasterizer, the only caller.
@@ -151,11 +133,12 @@ public:
             const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, bool ray_plane, int width,
             int height, int threads, const Inputs& color, const Inputs& depth_m, const Inputs& weights, const Array<double>& values, const Floats& g_means,
             const Floats& g_quats, const Floats& g_log_scales, const Floats& g_colors, const Floats& g_logits,
-            const Array<double>& g_pose, const Inputs& certainty) {
+            const Array<double>& g_pose, const Inputs& certainty, const Bytes& bytes, const Inputs& of_bytes) {
         const Use use(busy_);
         look(pose, intrinsics, background, mask, ray_plane, width, height, threads);
         const float* w = weights.data();
-        const Loss loss = {color.data(), depth_m.data(), certainty.is_valid() ? data_or_null(certainty) : nullptr, w[0], w[1], w[2], w[3], w[6], w[4], w[5], w[7]};
+        const Loss loss = {data_or_null(color), depth_m.data(), bytes.is_valid() ? bytes.data() : nullptr,
+                           of_bytes.is_valid() ? of_bytes.data() : nullptr, certainty.is_valid() ? data_or_null(certainty) : nullptr, w[0], w[1], w[2], w[3], w[6], w[4], w[5], w[7]};
         const GradientArrays out = {data_or_null(g_means),  data_or_null(g_quats), data_or_null(g_log_scales), data_or_null(g_colors),
                                     data_or_null(g_logits), nullptr,               data_or_null(g_pose)};
         const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
@@ -285,7 +268,8 @@ NB_MODULE(_raster, m) {
         .def("forward", &Raster::forward)
         .def("fit", &Raster::fit, "means"_a, "quats"_a, "log_scales"_a, "colors"_a, "logits"_a, "pose"_a, "intrinsics"_a, "background"_a,
              "mask"_a, "ray_plane"_a, "width"_a, "height"_a, "threads"_a, "color"_a, "depth_m"_a, "weights"_a, "values"_a, "g_means"_a,
-             "g_quats"_a, "g_log_scales"_a, "g_colors"_a, "g_logits"_a, "g_pose"_a, "certainty"_a.none() = nb::none())
+             "g_quats"_a, "g_log_scales"_a, "g_colors"_a, "g_logits"_a, "g_pose"_a, "certainty"_a.none() = nb::none(),
+             "bytes"_a.none() = nb::none(), "of_bytes"_a.none() = nb::none())
         .def("backward", &Raster::backward)
         .def("fisher", &Raster::fisher)
         .def("opacity_information", &Raster::opacity_information)
@@ -293,7 +277,6 @@ NB_MODULE(_raster, m) {
         .def("contributions", &Raster::contributions)
         .def("layer_depth", &Raster::layer_depth);
     m.def("adam", &raster::adam);
-    m.def("adam_rows", &raster::adam_rows);
     m.def("empty", &raster::OutputPool::array);
     m.def("fma_rate", &raster::fma_rate);
     m.def("bandwidth", &raster::bandwidth);

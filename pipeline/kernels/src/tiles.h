@@ -85,6 +85,19 @@ inline void read_block_rgb(const float* image, const Block& block, const View& v
     });
     for (int k = 0; k < 3; k++) rgb[k] = load(planes[k]);
 }
+// The three planes of an image of bytes, by a table [256, 3] of what they stand for.
+inline void read_block_rgb(const uint8_t* image, const float* table, const Block& block, const View& view, Vec* rgb) {
+    alignas(64) float planes[3][LANES] = {};
+    const auto read = [&](int lane, size_t p) ALWAYS_INLINE {
+        for (int k = 0; k < 3; k++) planes[k][lane] = table[3 * image[3 * p + k] + k];
+    };
+    if (block.whole) {
+        for (int lane = 0; lane < LANES; lane++) read(lane, block.pixel + static_cast<size_t>(lane / 4) * view.width + lane % 4);
+    } else {
+        block.for_each(view, read);
+    }
+    for (int k = 0; k < 3; k++) rgb[k] = load(planes[k]);
+}
 inline void write_block_rgb(float* image, const Block& block, const View& view, const Vec* rgb) {
     if (block.whole) {
         float* p = image + 3 * block.pixel;
