@@ -5,6 +5,7 @@ Light on purpose: a fresh process imports this module first, and from then on it
 
 import multiprocessing
 import os
+import pickle
 import resource
 import signal
 import threading
@@ -16,6 +17,18 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
+
+_handed_down: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
+
+
+def hand_down(known: Callable[[], Any], learn: Callable[[Any], None]) -> None:
+    """Let worker processes begin with something that this one has found out, and would find out again.
+
+    Args:
+        known: gives it when processes are about to start.
+        learn: called with it in each of them, before its first task.
+    """
+    _handed_down.append((known, learn))
 
 
 @contextmanager
@@ -39,7 +52,7 @@ def worker_pool(
         workers,
         multiprocessing.get_context("spawn"),
         _begin,
-        (start, arguments),
+        (pickle.dumps([(learn, known()) for known, learn in _handed_down]), start, arguments),
     )
     try:
         yield pool
@@ -56,9 +69,13 @@ def worker_pool(
     pool.shutdown()
 
 
-def _begin(start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
+def _begin(handed_down: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
+    for learn, known in pickle.loads(
+        handed_down
+    ):  # imports what it is of, so not before Ctrl-C is the parent's
+        learn(known)
     if start is not None:
         start(*arguments)
 

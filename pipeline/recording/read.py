@@ -25,6 +25,7 @@ from duagc import schemas
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.base.workers import hand_down
 from duagc.pipeline.recording.access import check_read
 from duagc.pipeline.recording.identity import ContentDigest, channel_identity, framed
 from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC
@@ -108,6 +109,19 @@ def _crc_of(stream: IO[bytes], start: int, stop: int) -> int:
 
 _verified: set[tuple[str, int, int, int]] = set()
 _publish_times: dict[tuple[str, int, int, int, str], dict[int, tuple[int, int, int]]] = {}
+
+
+def _known() -> tuple[Any, Any]:
+    """What this process knows of files, as long as they are unchanged."""
+    return set(_verified), dict(_publish_times)
+
+
+def _learn(known: tuple[Any, Any]) -> None:
+    _verified.update(known[0])
+    _publish_times.update(known[1])
+
+
+hand_down(_known, _learn)
 
 
 def verify(path: Path) -> None:

@@ -12,7 +12,9 @@ from mcap.writer import CompressionType, Writer
 
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.recording import LogWriter, content_digest, log_metadata, merge, read_log
+from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics
 from tests.fixtures.recording_logs import update, write_camera, write_updates
 
@@ -48,6 +50,35 @@ def test_many_chunks_come_back_in_order(tmp_path: Path) -> None:
             log.write(topics.COLOR.of("alpha"), m.pack_color(index, "alpha", blob, "jpeg"), index)
     assert [r.proto().data for r in read_log(path)] == blobs
     assert path.stat().st_size > 3_600_000
+
+
+def _opened(path: Path, others: dict[str, int]) -> tuple[int, int]:
+    """In a worker: how many chunks and how many checksummed bytes it takes to know all publish times of a log."""
+    from duagc.pipeline.recording import read
+
+    unpacked, summed = [], []
+    chunk, crc = read.LogFile._chunk, read._crc_of
+    read.LogFile._chunk = lambda self, start: unpacked.append(start) or chunk(self, start)  # type: ignore[method-assign]
+    read._crc_of = lambda stream, start, stop: summed.append(stop - start) or crc(stream, start, stop)
+    with read.LogFile(path) as log:
+        assert {topic: len(log.entries_by_time(topic)) for topic in others} == others
+    return len(unpacked), sum(summed)
+
+
+def test_a_worker_knows_the_logs_that_its_parent_knows(tmp_path: Path) -> None:
+    path = write_camera(tmp_path / "alpha.mcap")
+    counts = {topics.COLOR.of("alpha"): 4, topics.DEPTH.of("alpha"): 4}
+    with worker_pool(1) as pool:  # of a log that nobody has read yet
+        chunks, summed = pool.submit(_opened, path, counts).result()
+    assert chunks > 0
+    assert summed > 0.9 * path.stat().st_size
+    with LogFile(path) as log:
+        assert {topic: len(log.entries_by_time(topic)) for topic in counts} == counts
+    with worker_pool(1) as pool:
+        assert pool.submit(_opened, path, counts).result() == (0, 0)
+    path.write_bytes(path.read_bytes())  # another time: it may say something else
+    with worker_pool(1) as pool:
+        assert min(pool.submit(_opened, path, counts).result()) > 0
 
 
 def test_merge_orders_by_time_then_file_then_place(tmp_path: Path) -> None:
