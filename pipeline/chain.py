@@ -161,6 +161,8 @@ class Chain:
         done: Sequence[Carried],
         more: Mapping[str, str],
         workers: Callable[[], int],
+        *,
+        matched: Callable[[], Mapping[str, Any]] = dict,
     ) -> Carried:
         """Evaluation, report or view: of everything that is there.
 
@@ -169,6 +171,7 @@ class Chain:
             done: all stages before.
             more: digests of what else it reads.
             workers: how many robots it looks at at the same time, asked if it is computed; changes no bit.
+            matched: of the evaluation: what is known already of the features of robots, asked if it is computed.
         """
         carrier, recording = self._carrier, self._recording.path
         inputs = {name: d.content for c in done for name, d in c.entry.files.items()}
@@ -178,7 +181,8 @@ class Chain:
             with timing.stage(stage, carrier.folder):
                 if stage is stages.EVALUATION:
                     saved = carrier.checkpoints(carrier.key(stage, None, inputs)).folder
-                    steps.evaluation(carrier.folder, recording, workers(), saved, hear=self._watch.tell)
+                    known, hear = matched(), self._watch.tell
+                    steps.evaluation(carrier.folder, recording, workers(), saved, matched=known, hear=hear)
                 else:
                     step = steps.report if stage is stages.REPORT else steps.view
                     step(carrier.folder, recording, workers())

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from duagc import __version__
 from duagc.pipeline import preparation, steps
+from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Step
@@ -30,6 +31,9 @@ from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
 from duagc.pipeline.runs.folder import SCHEMA
 from duagc.pipeline.time_left import EVERY_S, TimeLeft
 from duagc.pipeline.watch import Watch, ticking
+
+if TYPE_CHECKING:
+    from duagc.pipeline.evaluation.map_agreement import MatchedViews
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 Found = TypeVar("Found")
@@ -82,6 +86,8 @@ class Job:
         self.missing: list[StageKey] = []
         self._calibration: dict[str, Any] = {}
         self._before: list[Carried] = []
+        self._inputs: dict[Path, str] = {}
+        self._known_sizes: dict[str, dict[str, int]] = {}
         self._place = place
         self._watch = Watch(self._hear)
         self._where: Any = None  # of the server that shows the run
@@ -121,9 +127,9 @@ class Job:
             check_ground_truth(self.recording)  # before minutes of work
         (self.folder / "config.toml").write_text(dump_config(self.config))
         self.calibrate()
-        for robot in self.recording.robots:
-            path = self.recording.log(robot)
-            if (found := self._digest(path)) != (expected := self.recording.digest(path.name)):
+        logs = [self.recording.log(robot) for robot in self.recording.robots]
+        for path, found in zip(logs, in_order(self._digest, logs), strict=True):
+            if found != (expected := self.recording.digest(path.name)):
                 self.log(
                     f"warning: {path}: has digest {found[:12]}, expected {expected[:12]} as in recording.json"
                 )
@@ -162,23 +168,37 @@ class Job:
         prepared = self._prepared(chain)
         own = [c for robot in prepared.values() for c in (robot.frontend, robot.information) if c is not None]
         done = list({c.label: c for c in own}.values())
-        if plan.has(stages.EXCHANGE):
-            exchange = self._noted(chain.exchange, prepared)
-            done.append(exchange)
-        if plan.has(stages.FUSION):
-            done += self._fused(chain, prepared, exchange)
-        self._write(done)
-        if self._watch.follower is not None and plan.has(stages.FUSION):
-            self._watch.follower.finished(self.folder, self.recording.path)
         workers = cache(lambda: self._fitting(self._sizes(self.recording.robots), READER_SHARE))
         cameras = self._calibration.get("calibration", {}).get("cameras")
         notes = {"calibration": _digest_of(cameras)} if cameras else {}
-        if plan.has(stages.EVALUATION):
-            done.append(self._noted(chain.reader, stages.EVALUATION, done, notes, workers))
+        with self._matching(prepared, workers) as matched:
+            if plan.has(stages.EXCHANGE):
+                exchange = self._noted(chain.exchange, prepared)
+                done.append(exchange)
+            if plan.has(stages.FUSION):
+                done += self._fused(chain, prepared, exchange)
             self._write(done)
+            if self._watch.follower is not None and plan.has(stages.FUSION):
+                self._watch.follower.finished(self.folder, self.recording.path)
+            if plan.has(stages.EVALUATION):
+                evaluate = partial(chain.reader, matched=matched)
+                done.append(self._noted(evaluate, stages.EVALUATION, done, notes, workers))
+                self._write(done)
         readers = self._shown(chain, done, notes, workers)
         self._write([*done, *readers])
         return [*self._before, *done, *readers]
+
+    def _matching(
+        self, prepared: dict[str, Prepared], workers: Callable[[], int]
+    ) -> AbstractContextManager[Callable[[], dict[str, MatchedViews]]]:
+        """The part of the evaluation that needs no more than the front ends, next to an exchange that is computed."""
+        if self.carrier.looking or not self.plan.has(stages.EVALUATION):
+            return nullcontext(dict)
+        looking = Chain(self.recording, self._looking_carrier(), self.digests)
+        _, absent = self._looked_up([stages.EXCHANGE.name], lambda _: looking.exchange(prepared))
+        if not absent or workers() == 1:
+            return nullcontext(dict)
+        return self._processes().matching({name: self.recording.log(name) for name in prepared})
 
     def _shown(
         self, chain: Chain, done: list[Carried], notes: dict[str, str], workers: Callable[[], int]
@@ -304,8 +324,8 @@ class Job:
             return
         from duagc.pipeline.checks.check import check_registration
 
-        for robot in robots:
-            for finding in check_registration(self.recording.log(robot)):
+        for findings in in_order(check_registration, [self.recording.log(robot) for robot in robots]):
+            for finding in findings:
                 self.log(finding.line())
 
     def _expected(
@@ -320,8 +340,12 @@ class Job:
     def _fitting(self, sizes: dict[str, dict[str, int]], share: float = 1.0) -> int:
         return workers_that_fit(list(sizes.values()), self.carrier, self.plan.workers, share=share)
 
-    def _sizes(self, robots: Sequence[str]) -> dict[str, dict[str, int]]:
-        return {name: steps.check_log(self.recording.log(name), robot_of(name)) for name in robots}
+    def _sizes(self, robots: Collection[str]) -> dict[str, dict[str, int]]:
+        """Sizes of logs, each looked at once."""
+        new = sorted({robot_of(name) for name in robots} - self._known_sizes.keys())
+        found = in_order(lambda robot: steps.check_log(self.recording.log(robot), robot), new)
+        self._known_sizes |= dict(zip(new, found, strict=True))
+        return {name: self._known_sizes[robot_of(name)] for name in robots}
 
     def _looking_carrier(self) -> Carrier:
         return replace(self.carrier, looking=True)
@@ -344,7 +368,10 @@ class Job:
         return True
 
     def _digest(self, path: Path) -> str:
-        return digest_file(path) if self.store is None else self.digests.of(path).content
+        """Digest of an input, as it was when it was first looked at."""
+        if path not in self._inputs:
+            self._inputs[path] = digest_file(path) if self.store is None else self.digests.of(path).content
+        return self._inputs[path]
 
     def _times(self, done: list[Carried]) -> dict[str, Any]:
         """What each stage took when it was computed."""

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from duagc.pipeline import watch
+from duagc.pipeline import steps, watch
 from duagc.pipeline.base import worker_reports
+from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.machine import memory_bytes
 from duagc.pipeline.base.thread_share import SharedThreads, ThreadShare, keep_share
 from duagc.pipeline.base.workers import worker_pool
@@ -123,11 +124,13 @@ def with_keyframes(
     """
     from duagc.pipeline.checks.check import expected_keyframes
 
-    counted = {robot: dict(size) for robot, size in sizes.items()}
-    for robot, size in counted.items():
+    def counted(robot: str) -> dict[str, int]:
+        size = dict(sizes[robot])
         if size["frames"] >= LONG_FRAMES:
             size["keyframes"] = expected_keyframes(recording.log(robot), rule).expected
-    return counted
+        return size
+
+    return dict(zip(sizes, in_order(counted, sizes), strict=True))
 
 
 def workers_that_fit(
@@ -242,6 +245,20 @@ class RobotProcesses:
             exchange: of the team.
         """
         return self._chain(watch.UNWATCHED).fusion(name, robot, exchange, threads=SharedThreads())
+
+    @contextmanager
+    def matching(self, logs: Mapping[str, Path]) -> Iterator[Callable[[], dict[str, Any]]]:
+        """While a process does what the evaluation can do already; what to call for it, by robot.
+
+        Args:
+            logs: of the robots' sensors, by name of the component.
+        """
+        with worker_pool(1) as pool:
+            tasks = {
+                name: pool.submit(steps.matched_views, name, log, self.folder) for name, log in logs.items()
+            }
+            pool.shutdown(wait=False)  # the process ends when it is done
+            yield lambda: {name: task.result() for name, task in tasks.items()}
 
     @contextmanager
     def viewing(self, done: Sequence[Carried], more: Mapping[str, str]) -> Iterator[Future[Carried]]:

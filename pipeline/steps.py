@@ -6,6 +6,7 @@ here and all that it imports stay the same. So imports are inside the functions.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex
 
@@ -17,6 +18,7 @@ from duagc.pipeline.base.worker_reports import Hear
 if TYPE_CHECKING:
     from duagc.pipeline.base.checkpoints import Checkpoints
     from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.evaluation.map_agreement import MatchedViews
     from duagc.pipeline.exchange.session import RoundWatch
     from duagc.pipeline.recording import Recording
     from duagc.pipeline.runs.robot_data import AgentInput, SessionResult
@@ -252,6 +254,7 @@ def evaluation(
     workers: int = 1,
     saved: Path | None = None,
     *,
+    matched: Mapping[str, MatchedViews] | None = None,
     hear: Hear = lambda step: None,
 ) -> None:
     """Measure the run.
@@ -261,13 +264,27 @@ def evaluation(
         recording: folder of its recording.
         workers: robots measured at the same time; changes no bit of the result.
         saved: folder of what is done, from which it goes on; None: nothing is saved.
+        matched: `matched_views` of robots, by name, where they are known already; changes no bit.
         hear: gets its steps; changes nothing.
     """
     from duagc.pipeline.evaluation import evaluate
 
     determinism.configure_opencv()
     threads = threads_per_worker(workers)
-    evaluate(folder, recording, threads=threads, workers=workers, saved=saved, hear=hear)
+    evaluate(folder, recording, threads=threads, workers=workers, saved=saved, matched=matched, hear=hear)
+
+
+def matched_views(robot: str, log: Path, folder: Path) -> MatchedViews:
+    """What the evaluation of a robot can do as soon as its front end is done.
+
+    Args:
+        robot: its name.
+        log: of its sensors.
+        folder: of the run.
+    """
+    from duagc.pipeline.evaluation.robot_measures import matched_views_of
+
+    return matched_views_of(folder, robot, log)
 
 
 def report(folder: Path, recording: Path, workers: int = 1) -> None:

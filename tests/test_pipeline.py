@@ -177,6 +177,17 @@ def test_a_trajectory_that_was_changed_is_not_evaluated(
     assert (changed / "metrics.json").read_bytes() == (small_run / "metrics.json").read_bytes()
 
 
+def test_measuring_a_run_again_in_one_process_gives_the_same_file(
+    small_runs: Path, small_run: Path, small_recording: Path
+) -> None:
+    """The run itself matched features while its robots exchanged, and measured each in a process of its own."""
+    again = small_runs / "measured_again"
+    shutil.copytree(small_run, again)
+    (again / "metrics.json").unlink()
+    evaluate(again, small_recording, threads=1, progress=False)
+    assert (again / "metrics.json").read_bytes() == (small_run / "metrics.json").read_bytes()
+
+
 def test_the_log_of_another_robot_is_refused(small_runs: Path, small_recording: Path) -> None:
     mixed = small_runs / "mixed"
     shutil.copytree(small_recording, mixed)

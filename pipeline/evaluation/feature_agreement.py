@@ -9,6 +9,7 @@ places, so this is evidence that it did not fit. It also judges the ground truth
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -36,48 +37,73 @@ HYPOTHESES = 64
 MIN_PAIRS = 10
 
 
-def feature_agreement(
+@dataclass(frozen=True)
+class MatchedPair:
+    """Two views with features in common that agree on one motion.
+
+    Attributes:
+        a: place of the one view among all.
+        b: of the other.
+        points_a: [k, 3], meters, in the camera frame of `a`.
+        points_b: [k, 3], the same points in the camera frame of `b`.
+    """
+
+    a: int
+    b: int
+    points_a: Array
+    points_b: Array
+
+
+def matched_pairs(
     colors: Sequence[NDArray[np.uint8]],
     depths_m: Sequence[NDArray[np.float32]],
     camera: PinholeCamera,
-    trajectories: Mapping[str, Array],
-    *,
     masks: Sequence[NDArray[np.bool_] | None] | None = None,
-) -> tuple[int, dict[str, float | Absent]]:
-    """Median over pairs of views of the median distance between a moved feature and its partner, pixels.
+) -> list[MatchedPair]:
+    """All pairs of views whose matches agree on one motion, by the images alone.
 
     Args:
         colors: uint8 RGB [h, w, 3] of every view.
         depths_m: [h, w], 0 = unknown.
-        trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
+        camera: of all views.
         masks: bool [h, w] of every view, pixels that may be used; None: all.
-    Returns:
-        Number of pairs, and the value of every trajectory.
     """
     masks = masks or [None] * len(colors)
     features = [
         extract(color, depth_m, camera, FEATURES, mask=mask)
         for color, depth_m, mask in zip(colors, depths_m, masks, strict=True)
     ]
-    medians: dict[str, list[float]] = {name: [] for name in trajectories}
-    pairs = 0
-    for a, b in combinations(range(len(features)), 2):
-        matched = _matched(features[a], features[b], a, b)
-        if matched is None:
-            continue
-        pairs += 1
-        for name, T in trajectories.items():
-            medians[name].append(_distance_px(*matched, se3.inverse(T[a]) @ T[b], camera))
-    if pairs < MIN_PAIRS:
+    found = (_matched(features[a], features[b], a, b) for a, b in combinations(range(len(features)), 2))
+    return [pair for pair in found if pair is not None]
+
+
+def feature_agreement(
+    pairs: Sequence[MatchedPair], camera: PinholeCamera, trajectories: Mapping[str, Array]
+) -> dict[str, float | Absent]:
+    """Median over pairs of views of the median distance between a moved feature and its partner, pixels.
+
+    Args:
+        pairs: of the views.
+        camera: of all views.
+        trajectories: T_frame_camera [n, 4, 4] of all views, by name.
+    Returns:
+        The value of every trajectory.
+    """
+    if len(pairs) < MIN_PAIRS:
         absent = Absent(
-            f"only {pairs} pairs of held-out views have features in common, {MIN_PAIRS} are needed"
+            f"only {len(pairs)} pairs of held-out views have features in common, {MIN_PAIRS} are needed"
         )
-        return pairs, dict.fromkeys(trajectories, absent)
-    return pairs, {name: float(np.median(values)) for name, values in medians.items()}
+        return dict.fromkeys(trajectories, absent)
+    return {
+        name: float(
+            np.median([_distance_px(pair, se3.inverse(T[pair.a]) @ T[pair.b], camera) for pair in pairs])
+        )
+        for name, T in trajectories.items()
+    }
 
 
-def _matched(ours: Features, theirs: Features, a: int, b: int) -> tuple[Array, Array] | None:
-    """Points of matches that agree on one motion, each [k, 3] in its own camera frame; None if too few do."""
+def _matched(ours: Features, theirs: Features, a: int, b: int) -> MatchedPair | None:
+    """Two views by the matches that agree on one motion; None if too few do."""
     pairs = matches(ours.descriptors, theirs.descriptors, RATIO)
     if len(pairs) < MIN_MATCHES:
         return None
@@ -86,12 +112,12 @@ def _matched(ours: Features, theirs: Features, a: int, b: int) -> tuple[Array, A
     _, agree = ransac(points_a, points_b, inlier_m=INLIER_M, hypotheses=HYPOTHESES, rng=rng, weighted=False)
     if agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)):
         return None
-    return points_a[agree], points_b[agree]
+    return MatchedPair(a, b, points_a[agree], points_b[agree])
 
 
-def _distance_px(points_a: Array, points_b: Array, T_a_b: Array, camera: PinholeCamera) -> float:
+def _distance_px(pair: MatchedPair, T_a_b: Array, camera: PinholeCamera) -> float:
     """Median distance in the image, both ways together; a point behind the other camera is infinitely far."""
-    ways = ((points_b, points_a, T_a_b), (points_a, points_b, se3.inverse(T_a_b)))
+    ways = ((pair.points_b, pair.points_a, T_a_b), (pair.points_a, pair.points_b, se3.inverse(T_a_b)))
     distances = []
     for moved, seen, T in ways:
         there = se3.transform(T, moved)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.evaluation.depth_agreement import depth_agreement
-from duagc.pipeline.evaluation.feature_agreement import feature_agreement
+from duagc.pipeline.evaluation.feature_agreement import MatchedPair, feature_agreement, matched_pairs
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import NO_ROTATIONS, Paired
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.statistics import evenly_spaced
-from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.recording import RgbdFrame, open_rgbd
 
 Path3D = Mapping[int, NDArray[np.float64]]
 """T_frame_camera [4, 4] by time stamp."""
@@ -25,6 +27,31 @@ VIEWS = 40
 OF_TRUTH = "_of_truth"
 
 
+@dataclass(frozen=True)
+class MatchedViews:
+    """Views of a robot and the features that they share.
+
+    Attributes:
+        frames: indices of the views.
+        pairs: of views, by their places in `frames`.
+    """
+
+    frames: tuple[int, ...]
+    pairs: list[MatchedPair]
+
+
+def matched_views(log_path: Path, known: Sequence[int], *, frontend: Path) -> MatchedViews:
+    """What `section` matches, as long as every frame has a pose in all paths: it needs none of them.
+
+    Args:
+        log_path: sensor log of the robot.
+        known: held-out frames that were tracked, in order.
+        frontend: as of `section`.
+    """
+    chosen = _chosen(known)
+    return _matched(chosen, *_images(log_path, chosen, frontend))
+
+
 def section(
     log_path: Path,
     held_out: Mapping[int, int],
@@ -32,6 +59,7 @@ def section(
     true: Paired | Absent,
     *,
     frontend: Path,
+    matched: MatchedViews | None = None,
 ) -> dict[str, Any]:
     """How well held-out views agree under trajectories, and under the ground truth where there is one.
 
@@ -43,6 +71,7 @@ def section(
         paths: by the ending of their names in the result.
         true: estimate and ground truth, paired.
         frontend: frontend.mcap of the robot, by which depth of another time is moved into that of its image.
+        matched: `matched_views` of the frames, if it is known already.
     Returns:
         `depth_agreement_m` and `feature_agreement_px` of every path, and of how many pairs of views.
     """
@@ -55,7 +84,7 @@ def section(
     else:
         of_truth = dict(zip(true.stamps_ns.tolist(), true.true, strict=True))
         with_truth, judged = [i for i in own if held_out[i] in of_truth], {**paths, OF_TRUTH: of_truth}
-    views = partial(_views, log_path, held_out, frontend=frontend)
+    views = partial(_views, log_path, held_out, frontend=frontend, matched=matched)
     if with_truth == own:
         return found | views(own, judged)
     truth_only = views(with_truth, judged)  # on the views that have some; it takes none from the others
@@ -69,23 +98,36 @@ def _views(
     paths: Mapping[str, Path3D],
     *,
     frontend: Path,
+    matched: MatchedViews | None,
 ) -> dict[str, Any]:
     """Agreement under every path of some of the held-out frames `known`, and of how many pairs."""
-    most = min(VIEWS, len(known))
-    chosen = [known[k] for k in evenly_spaced(len(known), most)]
-    with open_rgbd(log_path) as log:
-        log.move_depth_by(frontend)
-        camera, frames = log.camera, [log.frame(index) for index in chosen]
-    depths = [f.usable_depth for f in frames]
+    chosen = _chosen(known)
+    frames, camera = _images(log_path, chosen, frontend)
     poses = {
         name: np.array([path[held_out[index]] for index in chosen]).reshape(-1, 4, 4)
         for name, path in paths.items()
     }
-    pairs, by_depth = depth_agreement(depths, camera, poses)
-    colors, usable = [f.color for f in frames], [f.mask for f in frames]
-    matched, by_features = feature_agreement(colors, depths, camera, poses, masks=usable)
-    found: dict[str, Any] = {"depth_agreement_pairs": pairs, "feature_agreement_pairs": matched}
+    pairs, by_depth = depth_agreement([f.usable_depth for f in frames], camera, poses)
+    if matched is None or matched.frames != tuple(chosen):
+        matched = _matched(chosen, frames, camera)
+    by_features = feature_agreement(matched.pairs, camera, poses)
+    found: dict[str, Any] = {"depth_agreement_pairs": pairs, "feature_agreement_pairs": len(matched.pairs)}
     for name in paths:
         found[f"depth_agreement_m{name}"] = by_depth[name]
         found[f"feature_agreement_px{name}"] = by_features[name]
     return found
+
+
+def _chosen(known: Sequence[int]) -> list[int]:
+    return [known[k] for k in evenly_spaced(len(known), min(VIEWS, len(known)))]
+
+
+def _images(log_path: Path, chosen: Sequence[int], frontend: Path) -> tuple[list[RgbdFrame], PinholeCamera]:
+    with open_rgbd(log_path) as log:
+        log.move_depth_by(frontend)
+        return [log.frame(index) for index in chosen], log.camera
+
+
+def _matched(chosen: Sequence[int], frames: Sequence[RgbdFrame], camera: PinholeCamera) -> MatchedViews:
+    depths, usable = [f.usable_depth for f in frames], [f.mask for f in frames]
+    return MatchedViews(tuple(chosen), matched_pairs([f.color for f in frames], depths, camera, usable))

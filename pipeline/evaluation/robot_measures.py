@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from duagc.pipeline.evaluation import (
     pixel_errors,
     uncertainty_calibration,
 )
+from duagc.pipeline.evaluation.map_agreement import MatchedViews
 from duagc.pipeline.evaluation.rendering import Scored, poses_by_stamp, robot_scores
 from duagc.pipeline.evaluation.results import Absent, Row
 from duagc.pipeline.evaluation.true_paths import TruePaths
@@ -26,6 +27,8 @@ from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
 from duagc.pipeline.runs.stages import EVALUATION
 from duagc.pipeline.splat.gaussians import Gaussians
+
+FRONTEND = "frontend.mcap"
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ class RobotTask:
         progress: show it on standard error.
         most_views: of a set that maps are scored at, evenly spread.
         saved: folder of the parts that are done, from which a process goes on that follows one that was killed.
+        matched: what is known already of the features of robots, by name.
     """
 
     run_dir: Path
@@ -66,6 +70,7 @@ class RobotTask:
     progress: bool
     most_views: int
     saved: Path | None = None
+    matched: Mapping[str, MatchedViews] = field(default_factory=dict)
 
     def in_worker(self, name: str, further: Mapping[str, Gaussians]) -> RobotMeasures:
         """In a process that knows nothing of the run yet.
@@ -123,7 +128,8 @@ class RobotTask:
             "pixels", lambda: pixel_errors.scores_of_robot(run, source, name, threads=self.threads)
         )
         hear((name, "agreement", 0, 1))
-        agreement = save.done("agreement", lambda: _agreement_section(robot, source, truth))
+        matched = self.matched.get(name)
+        agreement = save.done("agreement", lambda: _agreement_section(robot, source, truth, matched))
         hear((name, "agreement", 1, 1))
         return RobotMeasures(scores, agreement, calibration, rows, pixels)
 
@@ -164,11 +170,35 @@ def measuring(
         yield lambda: {name: result.result() for name, result in begun.items()}
 
 
-def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
-    held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
+def matched_views_of(run_dir: Path, name: str, log: Path) -> MatchedViews:
+    """What of the measures of a robot needs no more than its log and its front end, and takes seconds.
+
+    Args:
+        run_dir: folder of the run.
+        name: of the robot.
+        log: of its sensors.
+    """
+    determinism.configure_opencv()
+    with EVALUATION.running(run_dir):
+        robot = RobotRun(name, run_dir / "robots" / name)
+        return map_agreement.matched_views(
+            log, list(_held_out_stamps(robot)), frontend=robot.folder / FRONTEND
+        )
+
+
+def _held_out_stamps(robot: RobotRun) -> dict[int, int]:
+    """Stamp of every held-out frame that was tracked, by its index."""
+    return {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
+
+
+def _agreement_section(
+    robot: RobotRun, source: Recording, truth: TruePaths, matched: MatchedViews | None
+) -> dict[str, Any]:
+    held_out = _held_out_stamps(robot)
     paths = {"": poses_by_stamp(robot.trajectory), "_before_consensus": poses_by_stamp(robot.odometry)}
-    true, frontend = truth.after[robot.robot], robot.folder / "frontend.mcap"
-    return map_agreement.section(source.log(robot.robot), held_out, paths, true, frontend=frontend)
+    true, frontend = truth.after[robot.robot], robot.folder / FRONTEND
+    log = source.log(robot.robot)
+    return map_agreement.section(log, held_out, paths, true, frontend=frontend, matched=matched)
 
 
 def _calibration_of(robot: RobotRun, source: Recording, truth: TruePaths) -> tuple[dict[str, Any], list[Row]]:

@@ -20,6 +20,7 @@ from duagc.pipeline.evaluation import (
     pixel_errors,
     trajectory_errors,
 )
+from duagc.pipeline.evaluation.map_agreement import MatchedViews
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.rendering import (
     CENTRAL,
@@ -89,6 +90,7 @@ def evaluate(
     own_longer: Mapping[str, Gaussians] | None = None,
     most_views: int = MOST_VIEWS,
     saved: Path | None = None,
+    matched: Mapping[str, MatchedViews] | None = None,
     hear: Hear = lambda step: None,
 ) -> dict[str, Any]:
     """Measure a run against its recording and write metrics.json and metrics.parquet into its folder.
@@ -104,6 +106,8 @@ def evaluate(
         most_views: of a set that maps are scored at, evenly spread.
         saved: folder of the parts that are done, from which a process goes on that follows one that was killed;
             None: nothing is saved.
+        matched: what is known already of the features of robots, by name (`robot_measures.matched_views_of`);
+            changes no bit.
         hear: gets steps; changes nothing.
 
     Returns:
@@ -129,7 +133,7 @@ def evaluate(
         }
         for name in run.robots
     }
-    task = RobotTask(Path(run_dir), Path(recording), threads, progress, most_views, saved)
+    task = RobotTask(run_dir, recording, threads, progress, most_views, saved, matched=matched or {})
     with measuring(task, run, source, truth, workers=workers, further=further, hear=hear) as measures:
         of_team = {
             "team": _team_section(run, truth) | session.loop_closure_counts(),

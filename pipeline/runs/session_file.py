@@ -31,7 +31,6 @@ _DAMAGE = (  # what reading a damaged file raises; RuntimeError: a flag or a met
     AttributeError,
     RuntimeError,
 )
-_FAST = 1  # level of the compression: evidence is noise for the most part
 
 
 def write_session_result(path: Path, result: SessionResult) -> None:
@@ -61,10 +60,7 @@ def write_session_result(path: Path, result: SessionResult) -> None:
         "refused": result.refused,
         "types": [str(array.dtype) for array in arrays.arrays],
     }
-    with (
-        new_file(path) as part,
-        zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=_FAST) as file,
-    ):
+    with new_file(path) as part, zipfile.ZipFile(part, "w") as file:  # compressed it would be a fifth smaller
         with file.open("result.json", "w") as stream:  # unlike `writestr` it writes no time
             stream.write(json.dumps(plain).encode())
         for number, array in enumerate(arrays.arrays):
