@@ -284,7 +284,7 @@ def matched_views(robot: str, log: Path, folder: Path) -> MatchedViews:
     """
     from duagc.pipeline.evaluation.robot_measures import matched_views_of
 
-    return matched_views_of(folder, robot, log)
+    return matched_views_of(robot, log, folder)
 
 
 def report(folder: Path, recording: Path, workers: int = 1) -> None:

@@ -72,9 +72,8 @@ def worker_pool(
 def _begin(handed_down: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
-    for learn, known in pickle.loads(
-        handed_down
-    ):  # imports what it is of, so not before Ctrl-C is the parent's
+    # what it is of is imported here, and not before Ctrl-C is the parent's
+    for learn, known in pickle.loads(handed_down):
         learn(known)
     if start is not None:
         start(*arguments)

@@ -23,10 +23,8 @@ def psnr(rendered: NDArray, reference: NDArray, mask: NDArray[np.bool_] | None =
         reference: colors [H, W, 3] in 0..1.
         mask: bool [H, W], pixels that count; None: all.
     """
-    error = np.clip(np.asarray(rendered), 0, 1) - reference
-    if mask is not None and not mask.all():
-        error = error[mask]
-    return decibels(float(np.mean(np.square(error, out=error), dtype=np.float64)))
+    drawn, seen = (np.moveaxis(np.asarray(colors), -1, 0) for colors in (rendered, reference))
+    return psnr_of_planes(drawn, seen, mask)
 
 
 def psnr_of_planes(
@@ -39,8 +37,7 @@ def psnr_of_planes(
         reference: colors [3, H, W] in 0..1.
         mask: bool [H, W], pixels that count; None: all.
     """
-    error = np.clip(rendered, 0, 1)
-    error -= reference
+    error = np.clip(rendered, 0, 1) - reference
     if mask is not None and not mask.all():
         error = error[:, mask]
     return decibels(float(np.mean(np.square(error, out=error), dtype=np.float64)))

@@ -170,13 +170,13 @@ def measuring(
         yield lambda: {name: result.result() for name, result in begun.items()}
 
 
-def matched_views_of(run_dir: Path, name: str, log: Path) -> MatchedViews:
+def matched_views_of(name: str, log: Path, run_dir: Path) -> MatchedViews:
     """What of the measures of a robot needs no more than its log and its front end, and takes seconds.
 
     Args:
-        run_dir: folder of the run.
         name: of the robot.
         log: of its sensors.
+        run_dir: folder of the run.
     """
     determinism.configure_opencv()
     with EVALUATION.running(run_dir):

@@ -114,15 +114,13 @@ def score_view(
     colors = planes(render.color)
     psnr_db = _psnr(colors, image)
     fitted = _psnr_in_fitted_exposure(render, colors, image)
-    interpolated_db = (
-        psnr_db if exposure is None else _psnr(exposure.planes_in_image(colors, render.alpha), image)
-    )
+    interpolated_db = psnr_db if exposure is None else _psnr_in(exposure, render, colors, image)
     return ViewScore(
         psnr_db=psnr_db,
         psnr_interpolated_db=interpolated_db,
         psnr_moved_db=interpolated_db
         if moved is None
-        else _psnr(planes(in_exposure(moved, exposure).color), image),
+        else _psnr_in(exposure, moved, planes(moved.color), image),
         psnr_exposure_db=fitted[0],
         psnr_exposure_left_db=fitted[1],
         psnr_exposure_right_db=fitted[2],
@@ -152,6 +150,13 @@ def _psnr(colors: NDArray[np.float32], image: ComparedImage) -> Score:
     if image.mask is not None and not image.mask.any():
         return NO_PIXEL
     return min(image_metrics.psnr_of_planes(colors, image.planes, image.mask), PSNR_CEILING_DB)
+
+
+def _psnr_in(
+    exposure: Exposure | None, render: Render, colors: NDArray[np.float32], image: ComparedImage
+) -> Score:
+    """PSNR of a render, whose colors by channel are given, in an exposure."""
+    return _psnr(colors if exposure is None else exposure.planes_in_image(colors, render.alpha), image)
 
 
 def _psnr_in_fitted_exposure(

@@ -10,7 +10,7 @@ import operator
 import reprlib
 from enum import IntEnum
 from numbers import Real
-from typing import SupportsIndex
+from typing import SupportsIndex, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,7 @@ from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import GEOMETRY_SIZE
 
 Image = NDArray[np.float32]
+Element = TypeVar("Element", bound=np.generic)
 MAX_SIDE_PX = 16384
 MAX_THREADS = 1024
 LARGEST_LOG_SCALE = 40.0  # of meters; as in visibility.h
@@ -202,12 +203,7 @@ def checked_image(
         shape: expected.
         given_by: what the shape comes from, for the message.
     """
-    if not isinstance(image, np.ndarray) or image.dtype != np.float32:
-        found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
-        raise ValueError(f"{name} is {found}, expected an array of float32")
-    if image.shape != shape:
-        raise ValueError(f"{name} has shape {image.shape}, expected {shape}, the size of {given_by}")
-    return np.ascontiguousarray(image)
+    return _checked_array(name, image, np.float32, shape, meaning=f"the size of {given_by}")
 
 
 def checked_bytes(name: str, image: object, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -218,12 +214,19 @@ def checked_bytes(name: str, image: object, shape: tuple[int, ...]) -> NDArray[n
         image: as it was given.
         shape: expected, that of the camera.
     """
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
-        found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
-        raise ValueError(f"{name} is {found}, expected an array of uint8, since there is a table")
-    if image.shape != shape:
-        raise ValueError(f"{name} has shape {image.shape}, expected {shape}, the size of the camera")
-    return np.ascontiguousarray(image)
+    return _checked_array(name, image, np.uint8, shape, meaning="the size of the camera")
+
+
+def _checked_array(
+    name: str, array: object, dtype: type[Element], shape: tuple[int, ...], *, meaning: str
+) -> NDArray[Element]:
+    """A contiguous array of a type and a shape, whose meaning the message says."""
+    if not isinstance(array, np.ndarray) or array.dtype != dtype:
+        found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+        raise ValueError(f"{name} is {found}, expected an array of {np.dtype(dtype)}")
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}, {meaning}")
+    return np.ascontiguousarray(array)
 
 
 def refuse_bad_image(status: int, faults: dict[str, str]) -> None:

@@ -107,16 +107,18 @@ def _crc_of(stream: IO[bytes], start: int, stop: int) -> int:
     return crc
 
 
-_verified: set[tuple[str, int, int, int]] = set()
-_publish_times: dict[tuple[str, int, int, int, str], dict[int, tuple[int, int, int]]] = {}
+_Verified = set[tuple[str, int, int, int]]
+_PublishTimes = dict[tuple[str, int, int, int, str], dict[int, tuple[int, int, int]]]
+_verified: _Verified = set()
+_publish_times: _PublishTimes = {}
 
 
-def _known() -> tuple[Any, Any]:
+def _known() -> tuple[_Verified, _PublishTimes]:
     """What this process knows of files, as long as they are unchanged."""
     return set(_verified), dict(_publish_times)
 
 
-def _learn(known: tuple[Any, Any]) -> None:
+def _learn(known: tuple[_Verified, _PublishTimes]) -> None:
     _verified.update(known[0])
     _publish_times.update(known[1])
 
