@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
 
 from duagc.converters.simulate.render import meshes, triangles
 from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
@@ -80,6 +78,8 @@ def walk(
 
 def _walked(k: int, space: WalkableSpace, caster: Caster, cameras: Array, *, seed: int) -> Array:
     """Where figure k walks [frames, 2]; on longer routes if no route is long enough."""
+    from scipy.interpolate import CubicSpline
+
     graph, frames = space.graph.tocsr(), cameras.shape[1]
     length_m, least_m = frames * STEP_M + 1.0, START_M + STEP_M * (frames - 1)
     for asked_m in (0.0, least_m):
@@ -116,6 +116,8 @@ def _seen(caster: Caster, cameras: Array, middle: Array) -> float:
 
 def _upright(floor: Array, height: float) -> Array:
     """Poses [n, 4, 4] at places [n, 2] that face where they go."""
+    from scipy.ndimage import gaussian_filter1d
+
     ahead = np.gradient(gaussian_filter1d(floor, 8.0, axis=0, mode="nearest"), axis=0)
     yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
     poses = np.tile(np.eye(4), (len(floor), 1, 1))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.converters.simulate.scenes.scene import Ball, Box, Cylinder, Flat, Scene, Solid, Surface
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.arrays import Array
 
 LEVELS = 5
@@ -70,8 +71,12 @@ def bake(scene: Scene, texel_m: float, blocked: Blocked | None = None) -> Atlas:
     corners, height = _pack(shapes)
     lights = _lights(scene, blocked)
     atlas = np.zeros((height, ATLAS_WIDTH, 3), dtype=np.uint8)
-    for surface, shape, light, (x, y) in zip(scene.surfaces, shapes, lights, corners, strict=True):
-        tile = _tile(scene, surface, shape, light, texel_m=texel_m)
+
+    def painted(k: int) -> NDArray[np.uint8]:
+        return _tile(scene, scene.surfaces[k], shapes[k], lights[k], texel_m=texel_m)
+
+    tiles = in_order(painted, range(len(shapes)))
+    for tile, surface, shape, (x, y) in zip(tiles, scene.surfaces, shapes, corners, strict=True):
         wrap = cv2.BORDER_REPLICATE if isinstance(surface, Flat) else cv2.BORDER_WRAP
         m = MARGIN
         wide = cv2.copyMakeBorder(tile, 0, 0, m, m, wrap)

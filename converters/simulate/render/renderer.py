@@ -6,6 +6,7 @@ Color takes 2 x 2 samples of the surface at the center, or, next to a border bet
 whatever each of them hits; textures are read at the mip level whose texels are as large as the samples are apart.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -90,7 +91,8 @@ class Renderer:
         seen = surface.ravel()
         color = np.zeros((seen.size, 3), dtype=np.float32)
         inside = np.flatnonzero(~border & (seen >= 0))
-        color[inside] = self._inside(pose, inside, seen[inside].astype(np.int64))
+        inside = inside[np.argsort(seen[inside], kind="stable")]
+        color[inside] = self._inside(pose, inside, seen[inside])
         at = np.flatnonzero(border)
         if at.size:
             color[at] = self._border(pose, at, surface)
@@ -131,31 +133,29 @@ class Renderer:
         return hit
 
     def _inside(
-        self, pose: "_Pose", at: NDArray[np.int64], surface: NDArray[np.int64]
+        self, pose: "_Pose", at: NDArray[np.int64], surface: NDArray[np.int16]
     ) -> NDArray[np.float32]:
-        """Mean colors [n, 3] of pixels that one surface fills; `at` are their flat indices."""
+        """Mean colors [n, 3] of pixels that one surface fills; `at` are their flat indices, surface by surface."""
         assert self.atlas is not None
-        v, u = np.divmod(at, self.camera.width)
+        v, u = self.v[at // self.camera.width], self.u[at % self.camera.width]
         x, y = np.empty((4, at.size), dtype=np.float32), np.empty((4, at.size), dtype=np.float32)
-        straight = np.flatnonzero(~self.is_curved[surface])
-        c = pose.linear[surface[straight]]
-        center = c[:, :, 0] * u[straight, None] + (c[:, :, 1] * v[straight, None] + c[:, :, 2])
-        origin = self.atlas.origin[surface[straight]].T
         scale = 1 / self.atlas.texel_m
-        for i, (du, dv) in enumerate(INSIDE_OFFSETS):
-            inverse, s, t = (center + (du * c[:, :, 0] + dv * c[:, :, 1])).T
-            z = scale / inverse
-            x[i, straight] = origin[0] + s * z
-            y[i, straight] = origin[1] + t * z
-        for k in self.curved:
-            some = np.flatnonzero(surface == k)
-            if some.size:
-                x[:, some], y[:, some] = self._curved_inside(pose, k, u[some], v[some])
+        for k, part in _runs(surface):
+            if self.is_curved[k]:
+                x[:, part], y[:, part] = self._curved_inside(pose, k, u[part], v[part])
+                continue
+            c = pose.linear[k][:, :, None]
+            center = c[:, 0] * u[part] + (c[:, 1] * v[part] + c[:, 2])
+            for i, (du, dv) in enumerate(INSIDE_OFFSETS):
+                inverse, *st = center + (du * c[:, 0] + dv * c[:, 1])
+                z = scale / inverse
+                for out, at_surface, origin in zip((x, y), st, self.atlas.origin[k], strict=True):
+                    at_surface *= z
+                    at_surface += origin
+                    out[i, part] = at_surface
         return self._filtered(x, y)
 
-    def _curved_inside(
-        self, pose: "_Pose", k: int, u: NDArray[np.int64], v: NDArray[np.int64]
-    ) -> tuple[Array, Array]:
+    def _curved_inside(self, pose: "_Pose", k: int, u: Array, v: Array) -> tuple[Array, Array]:
         """Texels (x, y) [4, n] of the four samples of pixels that curved surface k fills."""
         assert self.atlas is not None
         du, dv = np.array(INSIDE_OFFSETS).T[:, :, None]
@@ -174,22 +174,21 @@ class Renderer:
         step = np.maximum((x[1] - x[0]) ** 2 + (y[1] - y[0]) ** 2, (x[2] - x[0]) ** 2 + (y[2] - y[0]) ** 2)
         mean = np.empty((n, 3), dtype=np.float32)
         fine = step <= 4.0  # the finest level holds nothing that samples two texels apart would miss
+        far = np.flatnonzero(~fine)
+        if not far.size:
+            return self._mean_of_four(0, x, y)
         near = np.flatnonzero(fine)
         mean[near] = self._mean_of_four(0, x[:, near], y[:, near])
-        far = np.flatnonzero(~fine)
-        if far.size:
-            level = np.clip(0.5 * np.log2(step[far]) - 1, 0, len(self.atlas.levels) - 1.001).astype(
-                np.float32
-            )
-            whole = level.astype(np.int64)
-            for k in range(len(self.atlas.levels) - 1):
-                some = np.flatnonzero(whole == k)
-                if some.size:
-                    index = far[some]
-                    blend = (level[some] - k)[:, None]
-                    finer = self._mean_of_four(k, x[:, index], y[:, index])
-                    coarser = self._mean_of_four(k + 1, x[:, index], y[:, index])
-                    mean[index] = (1 - blend) * finer + blend * coarser
+        level = np.clip(0.5 * np.log2(step[far]) - 1, 0, len(self.atlas.levels) - 1.001).astype(np.float32)
+        whole = level.astype(np.int64)
+        for k in range(len(self.atlas.levels) - 1):
+            some = np.flatnonzero(whole == k)
+            if some.size:
+                index = far[some]
+                blend = (level[some] - k)[:, None]
+                texels = x[:, index], y[:, index]
+                finer, coarser = self._mean_of_four(k, *texels), self._mean_of_four(k + 1, *texels)
+                mean[index] = (1 - blend) * finer + blend * coarser
         return mean
 
     def _mean_of_four(
@@ -209,41 +208,46 @@ class Renderer:
         """Mean colors [n, 3] of pixels near a border: 4 x 4 samples, each of the nearest of the surfaces around."""
         assert self.atlas is not None
         v, u = np.divmod(at, self.camera.width)
-        padded = np.pad(surface, 1, mode="edge").astype(np.int64)
+        padded = np.pad(surface, 1, mode="edge")
         around = np.stack([padded[v + dv, u + du] for dv in range(3) for du in range(3)], axis=1)
         around.sort(axis=1)
         around[:, 1:][around[:, 1:] == around[:, :-1]] = -1
-        pixel, _ = np.nonzero(around >= 0)
-        candidate = around[around >= 0]
+        pixel, column = np.nonzero(around >= 0)
+        candidate = around[pixel, column]
         order = np.argsort(candidate, kind="stable")
         pixel, candidate = pixel[order], candidate[order]
-        starts = np.flatnonzero(np.diff(candidate, prepend=-1))
         n = at.size
         best = np.zeros((n, 16))
         x, y = np.zeros((n, 16), dtype=np.float32), np.zeros((n, 16), dtype=np.float32)
         scale = 1 / self.atlas.texel_m
-        for first, last in zip(starts, [*starts[1:].tolist(), len(pixel)], strict=True):
-            k, some = int(candidate[first]), pixel[first:last]
+        for k, part in _runs(candidate):
+            some = pixel[part]
             us, vs = u[some, None] + BORDER_OFFSETS[:, 0], v[some, None] + BORDER_OFFSETS[:, 1]
+            nearest = best[some]
             if self.is_curved[k]:
                 inverse, s, t = pose.curved(k, us, vs)
-                hit = inverse > best[some]
-                sx, ty = scale * s, scale * t
+                hit = inverse > nearest
+                s *= scale
+                t *= scale
             else:
                 inverse, s, t = (c[0] * us + (c[1] * vs + c[2]) for c in pose.linear[k])
-                hit = inverse > best[some]
+                hit = inverse > nearest
                 hit &= self._covers(k, inverse, s, t)
                 with np.errstate(divide="ignore", invalid="ignore"):
                     z = scale / inverse
-                    sx, ty = s * z, t * z
-            row, column = np.nonzero(hit)
-            best[some[row], column] = inverse[row, column]
-            x[some[row], column] = self.atlas.origin[k, 0] + sx[row, column]
-            y[some[row], column] = self.atlas.origin[k, 1] + ty[row, column]
-        samples = self.atlas.sample(0, x.ravel(), y.ravel()).reshape(n, 16, 3)
-        found = best > 0
-        total = np.where(found[..., None], samples, 0).sum(axis=1, dtype=np.uint32)
-        return (total / np.maximum(found.sum(axis=1), 1)[:, None]).astype(np.float32)
+                    s *= z
+                    t *= z
+            best[some] = np.where(hit, inverse, nearest)
+            for out, at_surface, origin in zip((x, y), (s, t), self.atlas.origin[k], strict=True):
+                at_surface += origin
+                texel = out[some]
+                np.copyto(texel, at_surface, where=hit, casting="same_kind")
+                out[some] = texel
+        found = best.T > 0
+        samples = self.atlas.sample(0, x.T.ravel(), y.T.ravel()).reshape(16, n, 3)
+        samples[~found] = 0
+        total = np.add.reduce(samples, axis=0, dtype=np.uint16)
+        return (total / np.maximum(found.sum(axis=0), 1)[:, None]).astype(np.float32)
 
 
 class _Pose:
@@ -342,6 +346,13 @@ class _Pose:
             t = np.arccos(np.clip(q[..., 2] / surface.radius, -1, 1)) * surface.radius
             hit = (root > 0) & (z > NEAR_M)
         return np.where(hit, 1 / np.where(hit, z, 1.0), 0.0), s, t
+
+
+def _runs(values: NDArray[np.int16]) -> Iterator[tuple[int, slice]]:
+    """Every value of a sorted array, and where it stands."""
+    starts = np.flatnonzero(np.diff(values, prepend=-1)).tolist()
+    for first, last in zip(starts, [*starts[1:], len(values)], strict=True):
+        yield int(values[first]), slice(first, last)
 
 
 def _faces_around(surface: Surface) -> Array:

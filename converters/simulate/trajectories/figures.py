@@ -8,8 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, look_at
 from duagc.converters.simulate.trajectories.routes import ROUTE_STEP_M, route
@@ -150,6 +148,8 @@ class Ground:
             frames: of every path.
             seed: of figures, and of how cameras waver.
         """
+        from scipy.ndimage import distance_transform_edt
+
         self.terrain, self.space, self.frames, self.seed = terrain, terrain.free_space(), frames, seed
         self.planned = 0  # worked out so far
         self._graph = self.space.graph.tocsr()
@@ -207,6 +207,8 @@ class Ground:
 
     def bent(self, curve: Array) -> Array | None:
         """A curve [n, 2] moved aside until it is free, or None."""
+        from scipy.ndimage import gaussian_filter1d
+
         moved = np.zeros_like(curve)
         at = self._at(curve)
         for _ in range(40):
@@ -221,6 +223,9 @@ class Ground:
 
     def _steps(self, curve: Array, length_m: float, robot: int) -> GroundPath | None:
         """Even steps along the middle of a curve [n, 2], at the robot's height; None if too sharp or not clear."""
+        from scipy.interpolate import CubicSpline
+        from scipy.ndimage import gaussian_filter1d
+
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
         length_m = min(length_m, float(along[-1]))
         spline = CubicSpline(along, curve)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from duagc.converters.simulate.render.renderer import CameraRenderer, Renderer
 from duagc.converters.simulate.scenes.scene import UP, Scene
@@ -68,6 +67,8 @@ class Loop:
 
     def poses(self, frames: int, middle_angle: float) -> Array:
         """T_world_camera [frames, 4, 4], STEP_M apart along the loop, the middle frame at `middle_angle`."""
+        from scipy.interpolate import CubicSpline
+
         half = (frames - 1) / 2 * STEP_M
         reach = 1.3 * half / self.radii.min() + 0.2
         offset = np.linspace(-reach, reach, max(64, int(2 * reach * 100)))

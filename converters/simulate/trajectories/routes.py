@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from duagc.pipeline.base.arrays import Array
 
 if TYPE_CHECKING:
+    from scipy.sparse import coo_array
+
     from duagc.converters.simulate.trajectories.walks import WalkableSpace
 
 HOP_M = 2.0  # least distance between places that a route visits
@@ -32,6 +31,9 @@ def route(
         rng: draws the places.
         least_m: least length of the smoothed path; missed where that is less than a part of the way, 1 / MOST_TURNS.
     """
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.sparse.csgraph import dijkstra
+
     here = int(rng.integers(len(space.cells)))
     cells, total = [here], 0.0
     while True:

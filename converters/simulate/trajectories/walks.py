@@ -9,16 +9,15 @@ that pass, the first robot takes the one whose dullest view shows most; each oth
 part of its view with the robot before.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d, label
-from scipy.sparse import coo_array
 
 from duagc.converters.simulate.render.raycast import Caster
 from duagc.converters.simulate.render.renderer import CameraRenderer
@@ -30,6 +29,9 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+
+if TYPE_CHECKING:
+    from scipy.sparse import coo_array
 
 STEP_M = 0.028
 MAX_TURN_RAD = np.deg2rad(1.5)
@@ -176,6 +178,8 @@ def space_between(
         distance: of points [..., 3] to the nearest surface.
         closed: whether places [n, 2] are inside the scene.
     """
+    from scipy.ndimage import label
+
     cell_m = CELL_M if np.prod(high - low) < LARGE_M2 else 2 * CELL_M
     nx, ny = np.maximum(np.ceil((high - low) / cell_m).astype(np.int64), 1)
     x, y = low[0] + (np.arange(nx) + 0.5) * cell_m, low[1] + (np.arange(ny) + 0.5) * cell_m
@@ -223,6 +227,8 @@ def _closed_in(caster: Caster, places: Array, floor: float, share: float) -> NDA
 
 def _graph(inside: NDArray[np.bool_], clearance: Array, cell_m: float) -> coo_array:
     """Costs of steps between neighboring cells of a grid; dear near obstacles."""
+    from scipy.sparse import coo_array
+
     number = np.full(inside.shape, -1)
     number[inside] = np.arange(inside.sum())
     price = 1 + (0.45 / np.maximum(clearance, 0.1)) ** 4
@@ -281,6 +287,9 @@ def _look_ahead(
     path: Array, floor: float, robot: int, frames: int, *, step_m: float, rng: np.random.Generator
 ) -> Array | None:
     """Poses [frames, 4, 4] along a path that is long enough, step_m apart, or None if they turn too fast."""
+    from scipy.interpolate import CubicSpline
+    from scipy.ndimage import gaussian_filter1d
+
     along = ROUTE_STEP_M * np.arange(len(path))
     spline = CubicSpline(along, path)
     start = AHEAD_M
