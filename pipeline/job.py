@@ -11,8 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from duagc import __version__
-from duagc.pipeline import preparation, steps
+from duagc.pipeline import manifest, preparation, steps
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.thread_share import threads_per_worker
@@ -27,15 +26,13 @@ from duagc.pipeline.preparation import RobotProcesses, Say, carrier_of, with_key
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
-from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
-from duagc.pipeline.runs.folder import SCHEMA
+from duagc.pipeline.runs.digest import digest_file
 from duagc.pipeline.time_left import EVERY_S, TimeLeft
 from duagc.pipeline.watch import Watch, ticking
 
 if TYPE_CHECKING:
     from duagc.pipeline.evaluation.map_agreement import MatchedViews
 
-LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 Found = TypeVar("Found")
 READER_SHARE = 2.0  # memory of the evaluation of a robot, relative to its preparation
 FUSION_SHARE = 1.5  # the same of its fusion
@@ -205,7 +202,10 @@ class Job:
     ) -> list[Carried]:
         """Report and view; next to each other if there are several workers."""
         config = _digest_of(dump_config(self.config))
-        of_report = notes | {"config.toml": config, "times": _digest_of(self._times(done))}
+        of_report = notes | {
+            "config.toml": config,
+            "times": _digest_of(manifest.times([*self._before, *done])),
+        }
         wanted = {stages.REPORT: of_report, stages.VIEW: notes}
         wanted = {stage: more for stage, more in wanted.items() if self.plan.has(stage)}
         if len(wanted) > 1 and not self.carrier.looking:
@@ -373,51 +373,20 @@ class Job:
             self._inputs[path] = digest_file(path) if self.store is None else self.digests.of(path).content
         return self._inputs[path]
 
-    def _times(self, done: list[Carried]) -> dict[str, Any]:
-        """What each stage took when it was computed."""
-        return {carried.label: dict(carried.entry.timing) for carried in [*self._before, *done]}
-
     def _write(self, done: list[Carried]) -> None:
         """manifest.json and timing.json, of what is done."""
         if self.carrier.looking:
             return
-        executed = {carried.label: carried.executed for carried in done}
-        times = {
-            name: row | {"executed": executed.get(name, True)} for name, row in self._times(done).items()
-        }
-        _write_json(self.folder / "timing.json", {"stages": times})
-        _write_json(self.folder / "manifest.json", self._manifest(done) | self._calibration)
-
-    def _manifest(self, done: list[Carried]) -> dict[str, Any]:
-        """What went in and what came out, by digest."""
-        from importlib.metadata import version
-
-        files = {name: digest.content for carried in done for name, digest in carried.entry.files.items()}
-        manifest = {
-            "schema": SCHEMA,
-            "duagc": __version__,
-            "libraries": {name: version(name) for name in LIBRARIES},
-            "recording": preparation.way(self.folder, self.recording.path),
-            "config": digest_file(self.folder / "config.toml"),
-            "inputs": {robot: self._digest(self.recording.log(robot)) for robot in self.recording.robots},
-            "outputs": {n: digest for n, digest in files.items() if Path(n).suffix in RESULT_SUFFIXES},
-        }
-        if self.store is not None:
-            manifest["stages"] = {carried.label: _row(carried) for carried in [*self._before, *done]}
-        return manifest
-
-
-def _row(carried: Carried) -> dict[str, Any]:
-    entry = carried.entry
-    plain = entry.plain()
-    return {"key": entry.key.digest, "inputs": dict(entry.key.inputs)} | {
-        name: plain[name] for name in ("files", "result", "timing")
-    }
+        manifest.write_timing(self.folder, self._before, done)
+        manifest.write_manifest(
+            self.folder,
+            self.recording.path,
+            {robot: self._digest(self.recording.log(robot)) for robot in self.recording.robots},
+            done,
+            stages=None if self.store is None else [*self._before, *done],
+            more=self._calibration,
+        )
 
 
 def _digest_of(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")

@@ -175,12 +175,13 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "base config runs recording checks cache steps watch chain run_plan",
         ),
     ),
+    (_part("manifest", "what a run says about itself", "cache runs preparation"),),
     (
         _part(
             "job",
             "a run that is made",
             "base config runs recording evaluation viewing checks cache steps watch time_left chain preparation",
-            "run_plan",
+            "run_plan manifest",
         ),
     ),
     (
