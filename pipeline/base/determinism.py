@@ -2,7 +2,8 @@
 
 Call `configure_determinism()` before numpy, scipy or OpenCV is imported for the first time; child processes inherit the
 environment. One BLAS thread, because a product split over threads sums in another order; the AVX2 code paths of
-OpenBLAS, numpy and OpenCV on every machine, because their AVX-512 paths round differently. glibc gives the memory of an
+OpenBLAS, numpy and OpenCV on every machine, because their AVX-512 paths round differently; and nothing of Intel's IPP
+in OpenCV, which computes angles of SIFT another way on every family of processors. glibc gives the memory of an
 image back to the system as soon as it is freed, and clearing it again for the next one took a third of the time of a
 conversion: it keeps up to 64 MB.
 """
@@ -43,6 +44,8 @@ SETTINGS = {
     "OPENBLAS_CORETYPE": "Haswell",
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "OPENCV_CPU_DISABLE": opencv_paths_to_disable(_processor()),
+    "OPENCV_IPP": "disabled",
+    "OPENCV_LOG_LEVEL": "ERROR",  # it would warn of the line above
     "PYTHONHASHSEED": "0",
     "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 26),  # a small file can hold a large image
     "MALLOC_TRIM_THRESHOLD_": str(_KEPT_BYTES),

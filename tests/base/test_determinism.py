@@ -61,7 +61,13 @@ def test_opencv_is_asked_to_leave_out_only_what_the_processor_has(processor: str
     assert determinism.opencv_paths_to_disable(processor) == expected
 
 
-def test_opencv_loads_without_a_word() -> None:
-    code = "import duagc, cv2; print(cv2.useOptimized())"
+def test_opencv_loads_without_a_word_and_leaves_ipp_out_in_all_threads() -> None:
+    """IPP computes the angles of SIFT another way on every family of processors."""
+    code = """
+import duagc, cv2
+from concurrent.futures import ThreadPoolExecutor
+with ThreadPoolExecutor(1) as pool:
+    print(cv2.useOptimized(), cv2.ipp.useIPP(), pool.submit(cv2.ipp.useIPP).result())
+"""
     result = python("-c", code)
-    assert (result.stdout.strip(), result.stderr) == ("True", "")
+    assert (result.stdout.strip(), result.stderr) == ("True False False", "")
