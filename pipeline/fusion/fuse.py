@@ -134,7 +134,8 @@ class _TeamEvidence:
         for k, name in enumerate(names):
             part, common = slice(start[k], start[k + 1]), cameras.to_common(name).of(evidence[name])
             theta[part], information[part] = common.theta, common.information
-            SHELF.sweep()  # of a long log each of these is some hundred megabytes, and not looked at again
+            # of a long log each of these is some hundred megabytes, and not looked at again
+            SHELF.sweep(heap=True)
         theta, information = SHELF.put((theta, information))
         common_evidence = {
             n: replace(
@@ -220,7 +221,7 @@ def fuse(
         refused[team.start[team.names.index(name)] + np.flatnonzero(against)] = True
     found = _tracks(team, pairs, context, refused)
     matched = _fuse_tracks(team, found, _in_order_of(ids, self_information), context)
-    SHELF.sweep()
+    SHELF.sweep(heap=True)
     absorbed = matched.absorbed | refused
     moved = own.in_world()
     added = np.flatnonzero((team.owner != team.names.index(team.robot)) & ~absorbed)

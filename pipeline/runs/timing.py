@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.base.workers import peak_memory_bytes
 from duagc.pipeline.runs.stages import Stage
 
@@ -54,6 +55,8 @@ class Timing:
         """
         wall, cpu = time.perf_counter(), _processor_s()
         yield
+        # the process may have another stage to do, or wait for others with what it freed
+        SHELF.sweep(heap=True)
         self.stages[label(name, robot)] = {
             "stage": name,
             "robot": robot,
