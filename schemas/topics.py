@@ -197,7 +197,7 @@ REFINED_MAP = Topic(
     "duagc.v1.GaussianMap",
     "fusion",
     Scope.ROBOT,
-    "the fused map trained again, on own images and on what peers' maps show: the final map",
+    "the final map: the fused one trained on own images and peers' maps; information of what the fused one lacks",
 )
 CORRECTED_KEYFRAMES = Topic(
     "/<robot>/corrected_keyframes",

@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from duagc.converters.simulate.team import simulate
@@ -18,6 +19,7 @@ from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.oracle import Gap, gap_to_oracle
+from duagc.pipeline.evaluation.pixel_deviation import stated_in_world
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.exchange.session import run_session
 from duagc.pipeline.recording import Recording
@@ -25,7 +27,7 @@ from duagc.pipeline.replay import replay
 from duagc.pipeline.report import write_report
 from duagc.pipeline.runner import run
 from duagc.pipeline.runs.digest import digest, digest_file, result_files
-from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.runs.folder import RobotRun, RunFolder
 from duagc.pipeline.runs.session_file import read_session_result
 from duagc.pipeline.steps import agent_input, fuse_robot
 from tests.fixtures.late_program import run_late
@@ -271,3 +273,26 @@ def test_a_fusion_that_is_killed_goes_on_with_the_same_bits(
     assert said[0].startswith("training: goes on at ")
     for name in ("fused.mcap", "fused.ply", "refined.ply"):
         assert digest_file(robot / name) == digest_file(small_run / "robots" / "alpha" / name)
+
+
+def test_something_is_stated_of_every_gaussian_of_a_final_map(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    folder = small_runs / "finer" / "alpha"
+    shutil.copytree(small_run / "robots" / "alpha", folder)
+    log, result = Recording(small_recording).log("alpha"), read_session_result(folder / "session.npz")
+    config = load_config(
+        RunConfig, overrides=[*SMALL, "fusion.finer=1.0", "fusion.finetune.steps_per_view=1"]
+    )
+    fuse_robot("alpha", log, folder, result, config=config, threads=2)
+    robot = RobotRun("alpha", folder)
+    final, fused = robot.refined_map, robot.fused_map.information
+    assert final is not None
+    assert fused is not None
+    taken = final.information
+    assert taken is not None, "bravo saw nothing finer"
+    assert not np.isin(taken.ids, fused.ids).any()
+    assert np.isin(final.gaussians.ids, np.concatenate([fused.ids, taken.ids])).all()
+    sigma_m = stated_in_world(robot, final).sigma_m[np.isin(final.gaussians.ids, taken.ids)]
+    assert np.isfinite(sigma_m).all()
+    assert taken.stated_scale == fused.stated_scale

@@ -87,17 +87,18 @@ def stated_in_world(robot: RobotRun, shown: GaussianMap) -> StatedMap:
     """The fused or the final map of a robot.
 
     Training after fusion does not change what is stated of a Gaussian. Of those that a final map takes from a peer in
-    the place of own ones, the files of a run state nothing.
+    the place of own ones, it states itself what their owner knows.
 
     Args:
         robot: of a run.
         shown: one of these maps of it.
     """
-    information = robot.fused_map.information
-    if information is None:
-        return _stated(shown, np.zeros((len(shown.gaussians), 3, 3)))
-    rows = rows_by_id(shown.gaussians.ids, information.ids)
-    return _stated(shown, _of_rows(information, rows))
+    blocks = np.zeros((len(shown.gaussians), 3, 3))
+    for information in (robot.fused_map.information, shown.information):
+        if information is not None:
+            rows = rows_by_id(shown.gaussians.ids, information.ids)
+            blocks[rows >= 0] = position_information(information.geometry[rows[rows >= 0]])
+    return _stated(shown, blocks)
 
 
 def own_in_world(robot: RobotRun, own: StatedMap) -> StatedMap:

@@ -25,6 +25,7 @@ from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces
+from duagc.pipeline.fusion.final_start import FinalStart
 from duagc.pipeline.fusion.fuse import FusedMap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.projection import visible
@@ -43,7 +44,7 @@ def from_finest_views(
     factor: float,
     depth_images: DepthImages,
     depth_kinds: Mapping[str, DepthKind],
-) -> Gaussians:
+) -> FinalStart:
     """A fused map with peers' Gaussians in the place of own ones where a peer's keyframes saw the surface finer.
 
     Args:
@@ -60,19 +61,21 @@ def from_finest_views(
     """
     own_rows = np.flatnonzero(fused.source == fused.robots.index(robot))
     maps = {robot: fused.gaussians.select(own_rows)}
+    information: dict[str, Array] = {}
     for name in sorted(evidence):
         if len(evidence[name]):
             theirs = fused.colors[name].of(evidence[name])
             maps[name] = gaussians_of(theirs.ids, theirs.anchors, theirs.theta)
-    peers = sorted(maps.keys() - {robot})
+            information[name] = theirs.information
+    peers = sorted(information)
     if not peers:
-        return fused.gaussians
+        return FinalStart.of_fused(fused)
     found = _resolutions(
         maps, robot, T_world_keyframe, context=context, depth_images=depth_images, depth_kinds=depth_kinds
     )
     kept = np.ones(len(fused.gaussians), bool)
     kept[own_rows[_seen_finer(found[robot], robot, factor)]] = False
-    parts = [fused.gaussians.select(np.flatnonzero(kept))]
+    parts, stated = [fused.gaussians.select(np.flatnonzero(kept))], []
     next_id = int(fused.gaussians.ids.max()) + 1 if len(fused.gaussians) else 0
     for name in peers:
         taken = _belongs(found[name], name, robot, factor) & ~_imported(fused, name, maps[name].ids)
@@ -80,8 +83,9 @@ def from_finest_views(
             taken &= np.trace(mean_block(evidence[name].information), axis1=-2, axis2=-1) > 0
         rows = np.flatnonzero(taken)
         parts.append(maps[name].select(rows).replace(ids=next_id + np.arange(len(rows))))
+        stated.append(information[name][rows])
         next_id += len(rows)
-    return Gaussians.concatenate(parts)
+    return FinalStart(Gaussians.concatenate(parts), np.concatenate(stated))
 
 
 def _resolutions(

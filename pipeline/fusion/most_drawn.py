@@ -21,12 +21,13 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import Pairs
 from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.final_start import FinalStart
 from duagc.pipeline.fusion.fuse import FusedMap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.information import gaussians_of, mean_block
+from duagc.pipeline.splat.information import INFORMATION_SIZE, gaussians_of, mean_block
 
 
 def most_drawn(
@@ -37,7 +38,7 @@ def most_drawn(
     *,
     robot: str,
     views: Sequence[PosedRgbd],
-) -> Gaussians:
+) -> FinalStart:
     """The Gaussians that the training begins with, at most as many as the fused map has.
 
     Args:
@@ -51,19 +52,21 @@ def most_drawn(
         In the order of the fused map, then of the peers; ids of what comes in follow the largest of the fused map.
     """
     next_id = int(fused.gaussians.ids.max()) + 1 if len(fused.gaussians) else 0
-    parts = [fused.gaussians]
+    parts, stated = [fused.gaussians], [np.empty((0, INFORMATION_SIZE))]
     for name, rows in _others(fused, evidence, pairs, robot=robot, context=context):
         theirs = fused.colors[name].of(evidence[name].select(rows))
         parts.append(gaussians_of(next_id + np.arange(len(rows)), theirs.anchors, theirs.theta))
+        stated.append(theirs.information)
         next_id += len(rows)
-    everything = Gaussians.concatenate(parts)
+    everything, information = Gaussians.concatenate(parts), np.concatenate(stated)
     most = len(fused.gaussians)
     if context.config.most_final is not None:
         most = min(most, context.config.most_final)
     if len(everything) <= most:
-        return everything
-    best = np.argsort(-_drawn(everything, views, context), kind="stable")[:most]
-    return everything.select(np.sort(best))
+        return FinalStart(everything, information)
+    best = np.sort(np.argsort(-_drawn(everything, views, context), kind="stable")[:most])
+    taken = best[best >= len(fused.gaussians)] - len(fused.gaussians)
+    return FinalStart(everything.select(best), information[taken])
 
 
 def _others(

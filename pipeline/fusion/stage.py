@@ -19,6 +19,7 @@ from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.consensus.weighting import STATED_KINDS, in_world, self_information
 from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.final_start import FinalStart, stated_of_fused, stated_of_taken
 from duagc.pipeline.fusion.finest_views import from_finest_views
 from duagc.pipeline.fusion.finetune import finetune_map
 from duagc.pipeline.fusion.fuse import FusedMap, OwnMap, fuse
@@ -34,7 +35,6 @@ from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
     WORLD_FRAME,
     CorrectedKeyframes,
-    GaussianInformation,
     GaussianMap,
     Odometry,
     PeerColors,
@@ -47,17 +47,9 @@ from duagc.pipeline.recording.shutter import found_shutter_s
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.information import (
-    COLOR_INFORMATION,
-    MEAN_INFORMATION,
-    OPACITY_INFORMATION,
-    geometry_of_information,
-)
 from duagc.pipeline.splat.ply import write_ply
 from duagc.pipeline.splat.training_frames import blur_distance_m, training_frames
 from duagc.schemas import topics
-
-FUSED_KIND = "gauss_newton"
 
 
 @dataclass(frozen=True)
@@ -66,11 +58,13 @@ class _Fusion:
 
     Attributes:
         fused: the fused map.
+        start: of the finetuning.
         refined: the finetuned map; None for a robot that met no other.
         valid: what was used of the peers' maps, and the checks.
     """
 
     fused: FusedMap
+    start: FinalStart
     refined: Gaussians | None
     valid: ValidatedPeers
 
@@ -150,9 +144,9 @@ def _fuse(
     """
     valid, fused = save.done("fused", lambda: _untrained(own, result, views, context))
     if len(result.component) < 2:
-        return _Fusion(fused, None, valid)
-    trained = _finetuned(own, result, fused, valid, views=views, context=context, save=save)
-    return _Fusion(fused, trained, valid)
+        return _Fusion(fused, FinalStart.of_fused(fused), None, valid)
+    start, trained = _finetuned(own, result, fused, valid, views=views, context=context, save=save)
+    return _Fusion(fused, start, trained, valid)
 
 
 def _untrained(
@@ -210,13 +204,13 @@ def _finetuned(
     views: Sequence[PosedRgbd],
     context: MapContext,
     save: Checkpoints,
-) -> Gaussians | None:
+) -> tuple[FinalStart, Gaussians | None]:
     """The fused map trained on own images and on renders of peers' maps; None if the settings have no steps."""
     config = context.config.finetune
+    start, poses = FinalStart.of_fused(fused), result.T_world_keyframe_of
     if not config.steps_per_view:
-        return None
+        return start, None
     shown: Sequence[PosedRgbd] = ()
-    begun, poses = fused.gaussians, result.T_world_keyframe_of
     if config.peer_share:
         usable = valid.uncontradicted
         shown = peer_views(
@@ -230,9 +224,9 @@ def _finetuned(
         from_peers = len(shown) > 0 and context.config.imports_all
         if from_peers and context.config.final_start == "drawn":
             seen = [*views[: own.keyframes], *shown]
-            begun = most_drawn(fused, usable, valid.pairs, context, robot=own.robot, views=seen)
+            start = most_drawn(fused, usable, valid.pairs, context, robot=own.robot, views=seen)
         elif from_peers and context.config.finer is not None:
-            begun = from_finest_views(
+            start = from_finest_views(
                 fused,
                 usable,
                 poses,
@@ -243,8 +237,8 @@ def _finetuned(
                 depth_kinds=result.depth_of,
             )
     trained = None if shown else fused.source == fused.robots.index(own.robot)
-    return finetune_map(
-        begun,
+    refined = finetune_map(
+        start.gaussians,
         views,
         context,
         trained=trained,
@@ -252,6 +246,7 @@ def _finetuned(
         keyframes=own.keyframes,
         checkpoints=save,
     )
+    return start, refined
 
 
 def training_views(
@@ -325,13 +320,14 @@ def _write_log(path: Path, result: SessionResult, fusion: _Fusion, *, stamp_ns: 
         keyframe_indices=np.arange(len(result.T_world_keyframe), dtype=np.int32),
         T_world_keyframe=result.T_world_keyframe,
     )
-    information = _information(robot, fused, stamp_ns)
-    fused_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, fused.gaussians, information, depth_kind)
+    stated = stated_of_fused(robot, fused, stamp_ns)
+    fused_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, fused.gaussians, stated, depth_kind)
     with LogWriter(path, robot) as log:
         log.write(topics.CORRECTED_KEYFRAMES.of(robot), keyframes, stamp_ns, stamp_ns)
         log.write(topics.FUSED_MAP.of(robot), fused_map, stamp_ns, stamp_ns)
         if fusion.refined is not None:
-            refined_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, fusion.refined, None, depth_kind)
+            of_taken = stated_of_taken(robot, fusion.start, stamp_ns, stated_scale=fused.stated_scale)
+            refined_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, fusion.refined, of_taken, depth_kind)
             log.write(topics.REFINED_MAP.of(robot), refined_map, stamp_ns, stamp_ns)
         for peer, colors in sorted(fused.colors.items()):
             peer_colors = PeerColors(
@@ -370,29 +366,4 @@ def _report(robot: str, check: PeerCheck, stamp_ns: int) -> PeerMapReport:
         color_variance=check.color_variance,
         used=check.trusted,
         reason=check.reason,
-    )
-
-
-def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformation:
-    """The summed information of the fused Gaussians as a message; no cross terms between mean and covariance."""
-    stated = fused.information.copy()
-    stated[:, MEAN_INFORMATION] /= fused.stated_scale**2
-    return GaussianInformation(
-        stamp_ns=stamp_ns,
-        robot=robot,
-        kind=FUSED_KIND,
-        window="sum over the robots whose evidence was fused; observations count those robots",
-        ids=fused.gaussians.ids,
-        geometry=geometry_of_information(stated).astype(np.float32),
-        color=fused.information[:, COLOR_INFORMATION].astype(np.float32),
-        opacity=fused.information[:, OPACITY_INFORMATION].astype(np.float32),
-        observations=fused.members.astype(np.uint32),
-        color_sigma=0.0,
-        depth_sigma="as in the map of each member",
-        deviation_m=np.zeros(len(fused.gaussians), np.float32),  # included in the members' information
-        color_pixels_per_sample=1.0,
-        depth_pixels_per_sample=1.0,
-        overlap=1.0,
-        stated_scale=fused.stated_scale,
-        frame_id=WORLD_FRAME,
     )

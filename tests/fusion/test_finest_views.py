@@ -43,7 +43,7 @@ def known(name, gaussians, information):
 def final_map(poses, finer=1.5, walls=None, information=1.0):
     """Of alpha's final map: the places in alpha's view that its own Gaussians draw, and those that each peer's do."""
     maps = {name: wall() for name in poses} | (walls or {})
-    evidence = {n: known(n, g, information) for n, g in maps.items()}
+    evidence = {n: known(n, g, information * (k + 1)) for k, (n, g) in enumerate(maps.items())}
     config = FusionConfig(finer=finer, explained_px=0)
     origin, measured = np.eye(4)[None], [(0, MEASURED_M - np.float32(poses["alpha"][0, 2, 3]))]
     began = fused(
@@ -64,10 +64,22 @@ def final_map(poses, finer=1.5, walls=None, information=1.0):
         depth_images=measured,
         depth_kinds=dict.fromkeys(poses, "blended"),
     )
-    assert len(np.unique(found.ids)) == len(found)
-    own = found.ids < len(wall())
+    gaussians = found.gaussians
+    assert len(np.unique(gaussians.ids)) == len(gaussians)
+    own = gaussians.ids < len(wall())
+    assert np.array_equal(found.taken, gaussians.ids[gaussians.ids > began.gaussians.ids.max()])
+    assert_information_of_owners(found, evidence)
     view = seen_from(poses["alpha"])
-    return [places(found.means[rows]) & set(np.flatnonzero(view)) for rows in (own, ~own)]
+    return [places(gaussians.means[rows]) & set(np.flatnonzero(view)) for rows in (own, ~own)]
+
+
+def assert_information_of_owners(found, evidence):
+    """What is stated of the Gaussians that come in is what a peer stated; they come peer by peer."""
+    stated = found.information[:, 0]
+    by_peers = [e.information[0, 0] for name, e in evidence.items() if name != "alpha" and len(e)]
+    assert np.isin(stated, by_peers).all()
+    assert np.all(np.diff(stated) >= 0)
+    assert np.all(found.information == stated[:, None])
 
 
 def places(means):

@@ -55,8 +55,11 @@ def start(own, peers, *, pairs=None, information=1.0, most=None):
     context = MapContext(CAMERA, config, MATCHING)
     others = {name: evidence[name] for name in peers}
     found = most_drawn(began, others, pairs or {}, context, robot="alpha", views=[view, view])
-    assert len(np.unique(found.ids)) == len(found)
-    return found
+    gaussians = found.gaussians
+    assert len(np.unique(gaussians.ids)) == len(gaussians)
+    assert np.array_equal(found.taken, gaussians.ids[gaussians.ids > own.ids.max()])
+    assert np.all(found.information == information)
+    return gaussians
 
 
 def test_what_is_hidden_gives_way_to_what_a_peer_draws():
