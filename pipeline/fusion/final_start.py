@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.row_blocks import in_blocks
 from duagc.pipeline.fusion.fuse import FusedMap
 from duagc.pipeline.messages import WORLD_FRAME, GaussianInformation
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -106,15 +107,19 @@ def _stated(
     stamp_ns: int,
 ) -> GaussianInformation:
     """Information [n, 31] of Gaussians as a message; no cross terms between mean and covariance."""
-    stated = information.copy()
-    stated[:, MEAN_INFORMATION] /= stated_scale**2
+
+    def geometry(rows: Array) -> NDArray[np.float32]:
+        stated = rows.copy()
+        stated[:, MEAN_INFORMATION] /= stated_scale**2
+        return geometry_of_information(stated).astype(np.float32)
+
     return GaussianInformation(
         stamp_ns=stamp_ns,
         robot=robot,
         kind=FUSED_KIND,
         window=window,
         ids=ids,
-        geometry=geometry_of_information(stated).astype(np.float32),
+        geometry=in_blocks(geometry, information),
         color=information[:, COLOR_INFORMATION].astype(np.float32),
         opacity=information[:, OPACITY_INFORMATION].astype(np.float32),
         observations=members.astype(np.uint32),

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.row_blocks import row_blocks
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.consensus.colors import ColorMap, TeamColors, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
@@ -78,6 +79,11 @@ class FusedMap:
     colors: dict[str, ColorMap]
     stated_scale: float = 1.0
 
+    def shelved(self) -> FusedMap:
+        """The same, with what no training looks at in a file: of a long log some hundred megabytes."""
+        theta, information = SHELF.put((self.theta, self.information))
+        return replace(self, theta=theta, information=information)
+
 
 @dataclass(frozen=True)
 class OwnMap:
@@ -132,8 +138,10 @@ class _TeamEvidence:
         theta = np.empty((start[-1], THETA_SIZE))
         information = np.empty((start[-1], INFORMATION_SIZE))
         for k, name in enumerate(names):
-            part, common = slice(start[k], start[k + 1]), cameras.to_common(name).of(evidence[name])
-            theta[part], information[part] = common.theta, common.information
+            for rows in row_blocks(len(evidence[name])):
+                part = slice(start[k] + rows.start, start[k] + rows.stop)
+                common = cameras.to_common(name).of(evidence[name].select(rows))
+                theta[part], information[part] = common.theta, common.information
             # of a long log each of these is some hundred megabytes, and not looked at again
             SHELF.sweep(heap=True)
         theta, information = SHELF.put((theta, information))
@@ -227,9 +235,11 @@ def fuse(
     added = np.flatnonzero((team.owner != team.names.index(team.robot)) & ~absorbed)
     if context.config.coverage == "all" and len(added):
         surfaces = known_surfaces(moved, own.T_world_keyframe, depth_images, context)
+        theta, information = SHELF.put((team.theta[added], _information(team, matched, added)))
+        SHELF.sweep(heap=True)
         unseen = select_unseen(
-            team.theta[added],
-            _information(team, matched, added),
+            theta,
+            information,
             T_world_keyframe=own.T_world_keyframe,
             surfaces=surfaces,
             context=context,
@@ -283,6 +293,7 @@ def _fuse_tracks(
             common = team.cameras.to_common(team.robot)
             splats = common.of(self_information.select(found.row[mine]))
             taking_part = taking_part.with_rows(mine, EvidenceRows.of(splats.theta, splats.information))
+        SHELF.sweep(heap=True)
         tracked = TrackMembers(taking_part, reference, first)
         move = fused_moves(tracked, context.config, context.matching.thickness_floor_m)
     absorbed = np.zeros(len(team.theta), dtype=bool)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.row_blocks import in_blocks
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.config.fusion import PeerValidationConfig
 from duagc.pipeline.config.training import DepthKind
@@ -142,11 +143,12 @@ def validate_peer_maps(
     too_large = {}
     for name in sorted(peers):
         possible = _sizes_m(peers[name]) <= largest_m
-        peer = peers[name] if possible.all() else peers[name].select(possible)
+        peer = peers[name] if possible.all() else SHELF.put(peers[name].select(possible))
         too_large[name] = int(np.sum(~possible))
         near = _near(own, peer, _between(pairs, own.owner, name), radius_m)
         judged[name] = _PhotometricCheck(views, context, depth_kinds[name], config, arrived=arrived[name])
-        against = judged[name].contradicted(_in_colors_of(own, peer, near, matching), own_colors.variance)
+        shown = SHELF.put(_in_colors_of(own, peer, near, matching))
+        against = judged[name].contradicted(shown, own_colors.variance)
         used = slice(None) if judged[name].trusted(own_colors.pixels) else slice(0, 0)
         world[name], contradicted[name] = peer.select(used), against[used]
         judged[name].num_contradicted = int(np.sum(against))

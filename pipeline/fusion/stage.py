@@ -114,6 +114,7 @@ def run_fusion(
             source, frames, T_world_camera, num_support=num_support, seen_m=seen_m, moving=moving
         )
     fusion = _fuse(own, result, views, context, save=checkpoints or Checkpoints())
+    SHELF.sweep(heap=True)
     refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
     write_ply(folder / "fused.ply", fusion.fused.gaussians)
     write_ply(folder / "refined.ply", refined)
@@ -164,6 +165,7 @@ def _untrained(
         depth_kinds=result.depth_of,
         arrived=result.arrived,
     )
+    SHELF.sweep(heap=True)
     own_information = self_information(
         own.robot, own.gaussians, own.information, own.T_map_keyframe, kind=context.weights
     )
@@ -175,7 +177,8 @@ def _untrained(
         self_information=SHELF.put(in_world(own_information, poses[own.robot], context.weights)),
         depth_images=_depth_images(own),
         contradicted=valid.contradicted,
-    )
+    ).shelved()
+    SHELF.sweep(heap=True)
     if len(result.component) < 2:
         return valid, fused
     fused = update_opacities(
@@ -185,7 +188,7 @@ def _untrained(
         num_own=len(own.gaussians),
         color_sigma=own.information.color_sigma,
         pixels_per_sample=own.information.color_pixels_per_sample,
-    )
+    ).shelved()
     stated = context.config.stated_scale
     if not stated.enabled or context.weights not in STATED_KINDS:
         return valid, fused

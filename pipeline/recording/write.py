@@ -120,7 +120,9 @@ class LogWriter:
             raise ValueError(f"{topic} carries {schema}, expected {self._channels[topic].schema}")
         log_time_ns = int(log_time_ns)
         publish_time_ns = log_time_ns if publish_time_ns is None else int(publish_time_ns)
-        self._append(topic, proto.SerializeToString(deterministic=True), log_time_ns, publish_time_ns)
+        data = proto.SerializeToString(deterministic=True)
+        del proto  # a map's takes as much memory again
+        self._append(topic, data, log_time_ns, publish_time_ns)
 
     @property
     def last_log_time_ns(self) -> int:
