@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.exchange import EvidenceOrder
 from duagc.pipeline.consensus.evidence import Evidence, PlacedGaussians, moved_parameters
@@ -141,4 +142,5 @@ def match_pairs(
         )
         for _, records, T_common in (own, peer)
     )
+    SHELF.sweep(heap=True)
     return match(a, b, config)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.exchange.wire import evidence_wire, state_wire
 from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList
@@ -70,7 +71,7 @@ class Knowledge:
         if owner == self.own:
             raise MalformedError("evidence: a neighbor speaks for this robot")
         if owner not in self.evidence:
-            self.evidence[owner], self.bodies[owner] = records, body
+            self.evidence[owner], self.bodies[owner] = SHELF.put((records, body))
             self.evidence_bytes[owner] = payload
         return owner
 

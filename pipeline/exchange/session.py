@@ -10,6 +10,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.recall import Recall, Recalling, computed
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange.injection import check_liar
 from duagc.pipeline.exchange.map_agent import MapAgent
@@ -51,7 +52,8 @@ def run_session(
     Raises:
         DuagError: a file that an agent needs is missing or broken, or the team is too large.
     """
-    data = [load(i) for i in sorted(inputs, key=lambda i: i.robot)]
+    data = [SHELF.put(load(i)) for i in sorted(inputs, key=lambda i: i.robot)]
+    SHELF.sweep(heap=True)
     return run_session_of(
         data,
         config,

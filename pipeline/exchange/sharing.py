@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.recall import Recalling, computed
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.consensus.evidence import rows_by_id
 from duagc.pipeline.exchange import injection
@@ -88,12 +89,15 @@ class Sharing:
     def _ordered_body(self) -> NDArray[Any]:
         records = own_records(self.data, self.kind, self.config.weights)
         order = order_of_sending(records, self.config.evidence_order, self.seed, self.data.robot)
-        return evidence_wire.to_body(self.kind, records[order])
+        body = SHELF.put(evidence_wire.to_body(self.kind, records[order]))
+        del records
+        SHELF.sweep(heap=True)
+        return body
 
     def own_records(self) -> NDArray[Any]:
         """Own evidence as the others read it, best first."""
         if self._records is None:
-            self._records = evidence_wire.from_body(self.kind, self.own_body())
+            self._records = SHELF.put(evidence_wire.from_body(self.kind, self.own_body()))
         return self._records
 
     def _sent(self) -> slice:
@@ -107,7 +111,7 @@ class Sharing:
                 self.own_records(), self.config.injection, seed=self.seed, robot=self.data.robot
             )
             self._body_sent = (
-                self.own_body() if records is None else evidence_wire.to_body(self.kind, records)
+                self.own_body() if records is None else SHELF.put(evidence_wire.to_body(self.kind, records))
             )
         return self._body_sent[self._sent()]
 
