@@ -44,35 +44,31 @@ class EvidenceRows:
 
     Attributes:
         theta: [r, 13].
-        position: [r, 3, 3], information of the mean, 1/m^2.
-        shape: [r, 6, 6], information of vec log Sigma.
-        color: [r, 3].
-        opacity: [r].
+        information: [r, 31].
     """
 
     theta: Array
-    position: Array
-    shape: Array
-    color: Array
-    opacity: Array
+    information: Array
 
-    @staticmethod
-    def of(theta: Array, information: Array) -> EvidenceRows:
-        """The rows of theta [r, 13] and information [r, 31]."""
-        return EvidenceRows(
-            theta,
-            mean_block(information),
-            log_covariance_block(information),
-            information[:, COLOR_INFORMATION],
-            information[:, OPACITY_INFORMATION],
-        )
+    @property
+    def position(self) -> Array:
+        """[r, 3, 3], information of the mean, 1/m^2."""
+        return mean_block(self.information)
 
-    def with_rows(self, at: Index, other: EvidenceRows) -> EvidenceRows:
-        """Those of `other`, in order, in the places `at`."""
-        changed = {name: array.copy() for name, array in vars(self).items()}
-        for name, array in changed.items():
-            array[at] = getattr(other, name)
-        return EvidenceRows(**changed)
+    @property
+    def shape(self) -> Array:
+        """[r, 6, 6], information of vec log Sigma."""
+        return log_covariance_block(self.information)
+
+    @property
+    def color(self) -> Array:
+        """[r, 3]."""
+        return self.information[:, COLOR_INFORMATION]
+
+    @property
+    def opacity(self) -> Array:
+        """[r]."""
+        return self.information[:, OPACITY_INFORMATION]
 
 
 @dataclass(frozen=True)
@@ -99,7 +95,7 @@ class TrackMembers:
         ends = np.append(self.first, len(self.rows.theta))
         begin = ends[tracks.start]
         rows = slice(begin, ends[tracks.stop])
-        part = EvidenceRows(**{name: array[rows] for name, array in vars(self.rows).items()})
+        part = EvidenceRows(self.rows.theta[rows], self.rows.information[rows])
         return TrackMembers(part, self.reference[tracks] - begin, self.first[tracks] - begin)
 
     @cached_property

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.row_blocks import row_blocks
+from duagc.pipeline.base.row_blocks import in_blocks, row_blocks
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.consensus.colors import ColorMap, TeamColors, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
@@ -280,39 +280,53 @@ def _fuse_tracks(
     member = team.start[found.robot] + found.row
     first = np.flatnonzero(np.diff(found.track, prepend=-1)).astype(np.int64)
     track_of_member = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(member))))
-    known = np.trace(mean_block(team.information[member]), axis1=-2, axis2=-1)
+    known = in_blocks(lambda m: np.trace(mean_block(team.information[m]), axis1=-2, axis2=-1), member)
     reference = np.lexsort((np.arange(len(member)), -known, track_of_member))[first]
     reference[track_of_member[found.robot == me]] = np.flatnonzero(found.robot == me)
     representative = member[reference]
 
     move = np.zeros((len(first), THETA_SIZE))
     if len(first):
-        taking_part = EvidenceRows.of(team.theta[member], team.information[member])
+        theta, information = team.theta[member], team.information[member]
         mine = np.flatnonzero(found.robot == me)
         if context.config.association == "neighbors":
             common = team.cameras.to_common(team.robot)
             splats = common.of(self_information.select(found.row[mine]))
-            taking_part = taking_part.with_rows(mine, EvidenceRows.of(splats.theta, splats.information))
+            theta[mine], information[mine] = splats.theta, splats.information
+        tracked = TrackMembers(EvidenceRows(*SHELF.put((theta, information))), reference, first)
+        del theta, information
         SHELF.sweep(heap=True)
-        tracked = TrackMembers(taking_part, reference, first)
         move = fused_moves(tracked, context.config, context.matching.thickness_floor_m)
     absorbed = np.zeros(len(team.theta), dtype=bool)
     absorbed[member] = True
     absorbed[representative] = False
+    move, information = SHELF.put((move, _summed(team.information, member, first)))
     return _Tracks(
         representative,
         move,
         np.diff(np.append(first, len(member))).astype(np.int32),
-        np.add.reduceat(team.information[member], first, axis=0) if len(first) else team.information[:0],
+        information,
         absorbed,
     )
+
+
+def _summed(information: Array, member: Index, first: Index) -> Array:
+    """Information [g, 31] of every track, summed over its members."""
+    sums = np.empty((len(first), INFORMATION_SIZE))
+    ends = np.append(first, len(member))
+    for some in row_blocks(len(first)):
+        begin = ends[some.start]
+        rows = information[member[begin : ends[some.stop]]]
+        np.add.reduceat(rows, first[some] - begin, axis=0, out=sums[some])
+    return sums
 
 
 def _information(team: _TeamEvidence, matched: _Tracks, rows: Index) -> Array:
     """Information [n, 31] of some rows, summed over the members of those that stand for a track."""
     information = team.information[rows]
     places, track = matched.among(rows)
-    information[places] = matched.information[track]
+    for some in row_blocks(len(places)):
+        information[places[some]] = matched.information[track[some]]
     return information
 
 
@@ -324,19 +338,25 @@ def _fused_map(team: _TeamEvidence, matched: _Tracks, own_world: Gaussians, adde
     places, track = matched.among(order)
     members = np.ones(len(order), np.int32)
     members[places] = matched.members[track]
-    move = np.zeros((len(order), THETA_SIZE))
-    move[places] = matched.move[track]
-    theta = team.theta[order] + move
-    move[:, COLOR] /= common.gain
-    theta[:, COLOR] = common.from_other(theta[:, COLOR])
     sums = _information(team, matched, order)
     sums[:, COLOR_INFORMATION] *= common.gain**2
+    sums = SHELF.put(sums)
+    SHELF.sweep(heap=True)
+    move = np.zeros((len(order), THETA_SIZE))
+    move[places] = matched.move[track]
+    theta = team.theta[order]
+    theta += move
+    move[:, COLOR] /= common.gain
+    theta[:, COLOR] = common.from_other(theta[:, COLOR])
     own = slice(len(own_rows))
     kept = _applied(own_world, move[own], team.theta[own_rows, LOG_COVARIANCE])
+    del move
     ids = np.concatenate([team.evidence[n].ids for n in team.names])
     anchors = np.concatenate([team.evidence[n].anchors for n in team.names])
     next_id = int(own_world.ids.max()) + 1 if len(own_world) else 0
     imported = gaussians_of(next_id + np.arange(len(added)), anchors[added], theta[len(own_rows) :])
+    theta = SHELF.put(theta)
+    SHELF.sweep(heap=True)
     return FusedMap(
         gaussians=Gaussians.concatenate([kept, imported]),
         theta=theta,

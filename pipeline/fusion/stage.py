@@ -177,8 +177,7 @@ def _untrained(
         self_information=SHELF.put(in_world(own_information, poses[own.robot], context.weights)),
         depth_images=_depth_images(own),
         contradicted=valid.contradicted,
-    ).shelved()
-    SHELF.sweep(heap=True)
+    )
     if len(result.component) < 2:
         return valid, fused
     fused = update_opacities(
@@ -323,13 +322,16 @@ def _write_log(path: Path, result: SessionResult, fusion: _Fusion, *, stamp_ns: 
         keyframe_indices=np.arange(len(result.T_world_keyframe), dtype=np.int32),
         T_world_keyframe=result.T_world_keyframe,
     )
-    stated = stated_of_fused(robot, fused, stamp_ns)
+    stated = SHELF.put(stated_of_fused(robot, fused, stamp_ns))
+    SHELF.sweep(heap=True)
     fused_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, fused.gaussians, stated, depth_kind)
     with LogWriter(path, robot) as log:
         log.write(topics.CORRECTED_KEYFRAMES.of(robot), keyframes, stamp_ns, stamp_ns)
         log.write(topics.FUSED_MAP.of(robot), fused_map, stamp_ns, stamp_ns)
         if fusion.refined is not None:
-            of_taken = stated_of_taken(robot, fusion.start, stamp_ns, stated_scale=fused.stated_scale)
+            of_taken = SHELF.put(
+                stated_of_taken(robot, fusion.start, stamp_ns, stated_scale=fused.stated_scale)
+            )
             refined_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, fusion.refined, of_taken, depth_kind)
             log.write(topics.REFINED_MAP.of(robot), refined_map, stamp_ns, stamp_ns)
         for peer, colors in sorted(fused.colors.items()):
