@@ -79,12 +79,11 @@ _GAUSSIAN_FIELDS = (
 )
 
 
-def pack_gaussians(gaussians: Gaussians) -> Any:
-    """duagc.v1.GaussianArrays."""
-    arrays = {
-        field: pack_array(getattr(gaussians, name), dtype) for name, field, dtype, _ in _GAUSSIAN_FIELDS
-    }
-    return schemas.new("GaussianArrays", count=len(gaussians), **arrays)
+def _pack_gaussians(gaussians: Gaussians, m: Any) -> None:
+    """Set a duagc.v1.GaussianArrays, array by array: those of a long log take hundreds of megabytes."""
+    m.count = len(gaussians)
+    for name, field, dtype, _ in _GAUSSIAN_FIELDS:
+        setattr(m, field, pack_array(getattr(gaussians, name), dtype))
 
 
 def unpack_gaussians(m: Any) -> Gaussians:
@@ -145,28 +144,33 @@ class GaussianInformation:
 
     def pack(self) -> Any:
         """duagc.v1.GaussianInformation."""
-        message = schemas.new(
-            "GaussianInformation",
-            frame_id=self.frame_id or map_frame(self.robot),
-            robot=self.robot,
-            kind=self.kind,
-            window=self.window,
-            count=len(self.ids),
-            ids_int64=pack_array(self.ids, "int64"),
-            geometry_float32=pack_array(self.geometry, "float32"),
-            color_float32=pack_array(self.color, "float32"),
-            opacity_float32=pack_array(self.opacity, "float32"),
-            observations_uint32=pack_array(self.observations, "uint32"),
-            color_sigma=float(self.color_sigma),
-            depth_sigma=self.depth_sigma,
-            deviation_m_float32=pack_array(self.deviation_m, "float32"),
-            color_pixels_per_sample=float(self.color_pixels_per_sample),
-            depth_pixels_per_sample=float(self.depth_pixels_per_sample),
-            overlap=float(self.overlap),
-            stated_scale=float(self.stated_scale),
-        )
-        pack_stamp(message, self.stamp_ns)
+        message = schemas.new("GaussianInformation")
+        self.pack_into(message)
         return message
+
+    def pack_into(self, m: Any) -> None:
+        """Set a duagc.v1.GaussianInformation, array by array: those of a long log take hundreds of megabytes.
+
+        Args:
+            m: without values.
+        """
+        pack_stamp(m, self.stamp_ns)
+        m.frame_id = self.frame_id or map_frame(self.robot)
+        m.robot, m.kind, m.window = self.robot, self.kind, self.window
+        m.count = len(self.ids)
+        for field, array, dtype in (
+            ("ids_int64", self.ids, "int64"),
+            ("geometry_float32", self.geometry, "float32"),
+            ("color_float32", self.color, "float32"),
+            ("opacity_float32", self.opacity, "float32"),
+            ("observations_uint32", self.observations, "uint32"),
+            ("deviation_m_float32", self.deviation_m, "float32"),
+        ):
+            setattr(m, field, pack_array(array, dtype))
+        m.color_sigma, m.depth_sigma = float(self.color_sigma), self.depth_sigma
+        m.color_pixels_per_sample = float(self.color_pixels_per_sample)
+        m.depth_pixels_per_sample = float(self.depth_pixels_per_sample)
+        m.overlap, m.stated_scale = float(self.overlap), float(self.stated_scale)
 
     @staticmethod
     def unpack(m: Any) -> GaussianInformation:
@@ -214,15 +218,11 @@ class GaussianMap:
 
     def pack(self) -> Any:
         """duagc.v1.GaussianMap."""
-        message = schemas.new(
-            "GaussianMap",
-            frame_id=self.frame_id,
-            robot=self.robot,
-            gaussians=pack_gaussians(self.gaussians),
-            information=None if self.information is None else self.information.pack(),
-            depth=self.depth,
-        )
+        message = schemas.new("GaussianMap", frame_id=self.frame_id, robot=self.robot, depth=self.depth)
         pack_stamp(message, self.stamp_ns)
+        _pack_gaussians(self.gaussians, message.gaussians)
+        if self.information is not None:
+            self.information.pack_into(message.information)
         return message
 
     @staticmethod

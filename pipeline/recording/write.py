@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from duagc import schemas
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.recording.access import check_write
 from duagc.pipeline.recording.identity import ContentDigest, channel_identity
 from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, ROBOT_KEY
@@ -20,6 +21,8 @@ from duagc.pipeline.recording.read import LogFile, Record
 from duagc.schemas import topics as topic_table
 
 CHUNK_BYTES = 1 << 20
+LARGE_BYTES = 32 << 20
+"""Of a message: the map of a long log."""
 
 
 def mcap_writer(stream: IO[bytes]) -> Writer:
@@ -122,6 +125,8 @@ class LogWriter:
         publish_time_ns = log_time_ns if publish_time_ns is None else int(publish_time_ns)
         data = proto.SerializeToString(deterministic=True)
         del proto  # a map's takes as much memory again
+        if len(data) > LARGE_BYTES:
+            SHELF.sweep(heap=True)  # the writer holds four times as much meanwhile
         self._append(topic, data, log_time_ns, publish_time_ns)
 
     @property
