@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.row_blocks import in_blocks, row_blocks
 from duagc.pipeline.base.shelf import SHELF
-from duagc.pipeline.consensus.colors import ColorMap, TeamColors, team_colors
+from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import Pairs, tracks
 from duagc.pipeline.consensus.matching import Tracks as FoundTracks
 from duagc.pipeline.fusion.association import EvidenceRows, TrackMembers, fused_moves
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces, select_unseen
+from duagc.pipeline.fusion.team_evidence import TeamEvidence
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import (
@@ -109,67 +110,6 @@ class OwnMap:
 
 
 @dataclass(frozen=True)
-class _TeamEvidence:
-    """Evidence of all robots in common colors, one robot after the other, in order of name.
-
-    Attributes:
-        robot: the receiver.
-        names: of all robots.
-        evidence: by name, world frame, common colors.
-        cameras: how the robots' colors relate.
-        theta: [rows, 13], of all evidence.
-        information: [rows, 31], likewise.
-        start: int64 [r + 1], first row of every robot, and the number of rows.
-    """
-
-    robot: str
-    names: tuple[str, ...]
-    evidence: dict[str, Evidence]
-    cameras: TeamColors
-    theta: Array
-    information: Array
-    start: Index
-
-    @staticmethod
-    def of(robot: str, evidence: Mapping[str, Evidence], pairs: Pairs, context: MapContext) -> _TeamEvidence:
-        names = tuple(sorted(evidence))
-        cameras = team_colors(evidence, pairs, context.matching.colors)
-        start = np.concatenate([[0], np.cumsum([len(evidence[n]) for n in names])]).astype(np.int64)
-        theta = np.empty((start[-1], THETA_SIZE))
-        information = np.empty((start[-1], INFORMATION_SIZE))
-        for k, name in enumerate(names):
-            for rows in row_blocks(len(evidence[name])):
-                part = slice(start[k] + rows.start, start[k] + rows.stop)
-                common = cameras.to_common(name).of(evidence[name].select(rows))
-                theta[part], information[part] = common.theta, common.information
-            # of a long log each of these is some hundred megabytes, and not looked at again
-            SHELF.sweep(heap=True)
-        theta, information = SHELF.put((theta, information))
-        common_evidence = {
-            n: replace(
-                evidence[n],
-                theta=theta[start[k] : start[k + 1]],
-                information=information[start[k] : start[k + 1]],
-            )
-            for k, n in enumerate(names)
-        }
-        return _TeamEvidence(
-            robot, names, common_evidence, cameras, theta=theta, information=information, start=start
-        )
-
-    @property
-    def own_rows(self) -> Index:
-        """Rows of the receiver."""
-        me = self.names.index(self.robot)
-        return np.arange(self.start[me], self.start[me + 1])
-
-    @property
-    def owner(self) -> Index:
-        """Index of the robot of every row."""
-        return np.repeat(np.arange(len(self.names)), np.diff(self.start))
-
-
-@dataclass(frozen=True)
 class _Tracks:
     """What matched Gaussians become.
 
@@ -223,7 +163,7 @@ def fuse(
     """
     ids = own.gaussians.ids
     ordered = {n: _in_order_of(ids, e) if n == own.robot else e for n, e in evidence.items()}
-    team = _TeamEvidence.of(own.robot, ordered, pairs, context)
+    team = TeamEvidence.of(own.robot, ordered, pairs, context)
     refused = np.zeros(len(team.theta), dtype=bool)
     for name, against in (contradicted or {}).items():
         refused[team.start[team.names.index(name)] + np.flatnonzero(against)] = True
@@ -250,9 +190,7 @@ def fuse(
     return _fused_map(team, matched, moved, added)
 
 
-def _tracks(
-    team: _TeamEvidence, pairs: Pairs, context: MapContext, refused: NDArray[np.bool_]
-) -> FoundTracks:
+def _tracks(team: TeamEvidence, pairs: Pairs, context: MapContext, refused: NDArray[np.bool_]) -> FoundTracks:
     """All tracks; refused rows [rows] take part only in those of the receiver, and leave the others what they saw."""
     found = tracks(team.evidence, pairs, context.matching)
     own = np.zeros(len(np.unique(found.track)), dtype=bool)
@@ -273,7 +211,7 @@ def _tracks(
 
 
 def _fuse_tracks(
-    team: _TeamEvidence, found: FoundTracks, self_information: Evidence, context: MapContext
+    team: TeamEvidence, found: FoundTracks, self_information: Evidence, context: MapContext
 ) -> _Tracks:
     """Fuse all tracks; the receiver's row stands for a track, else that which knows its position best."""
     me = team.names.index(team.robot)
@@ -321,7 +259,7 @@ def _summed(information: Array, member: Index, first: Index) -> Array:
     return sums
 
 
-def _information(team: _TeamEvidence, matched: _Tracks, rows: Index) -> Array:
+def _information(team: TeamEvidence, matched: _Tracks, rows: Index) -> Array:
     """Information [n, 31] of some rows, summed over the members of those that stand for a track."""
     information = team.information[rows]
     places, track = matched.among(rows)
@@ -330,7 +268,7 @@ def _information(team: _TeamEvidence, matched: _Tracks, rows: Index) -> Array:
     return information
 
 
-def _fused_map(team: _TeamEvidence, matched: _Tracks, own_world: Gaussians, added: Index) -> FusedMap:
+def _fused_map(team: TeamEvidence, matched: _Tracks, own_world: Gaussians, added: Index) -> FusedMap:
     """The receiver's Gaussians as moved, then the imported ones, in the receiver's colors."""
     own_rows, robot = team.own_rows, team.robot
     common = team.cameras.to_common(robot)
