@@ -26,6 +26,8 @@ LEAST_BYTES = 64 << 10
 """Objects of less stay in memory."""
 MOST_FILES = 1 << 16
 """Open files that are asked for, if the system allows so many."""
+LARGE_BYTES = 32 << 20
+"""Of something that is written: an array or a map of a long log. What else can be given back then, is."""
 SWEEP_AFTER = 16
 """Objects, after which all pages are given back that were looked at since."""
 

@@ -16,7 +16,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -35,10 +35,10 @@ from duagc.pipeline.geometry import spd
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY
 
 Index = NDArray[np.int64]
+Rows = NDArray[np.int32] | NDArray[np.int64]
 Pairs = Mapping[tuple[str, str], Index]
 Placed = Evidence | PlacedGaussians
 SH_C0 = 0.28209479177387814  # color = 0.5 + SH_C0 * coefficient
-_CHUNK = 200_000  # pairs per pass, for memory
 _FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
 
 
@@ -62,17 +62,22 @@ def _without(delta: Array, v: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Chart:
-    """theta [n, 13] with thicknesses no less than the floor, and the held components of log Sigma [n, 3, 6]."""
+    """theta [n, 13] with thicknesses no less than the floor, and the held components of log Sigma [n, 3, 6].
+
+    `thick`: bool [n], those of which nothing is held.
+    """
 
     theta: Array
     held: Array
+    thick: NDArray[np.bool_]
 
     @staticmethod
     def of(theta: Array, config: MapMatching) -> _Chart:
         clamped = theta.copy()
         no_thinner = partial(_no_thinner, floor_m=config.thickness_floor_m)
         clamped[:, LOG_COVARIANCE] = in_blocks(no_thinner, theta[:, LOG_COVARIANCE])
-        return _Chart(clamped, held_thickness(theta[:, LOG_COVARIANCE], config.thickness_floor_m))
+        held = held_thickness(theta[:, LOG_COVARIANCE], config.thickness_floor_m)
+        return _Chart(clamped, held, ~np.any(held != 0, axis=(1, 2)))
 
 
 def _no_thinner(vec_log_covariance: Array, floor_m: float) -> Array:
@@ -82,16 +87,14 @@ def _no_thinner(vec_log_covariance: Array, floor_m: float) -> Array:
     return spd.sym_to_vec((vectors * values[:, None, :]) @ vectors.swapaxes(-1, -2))
 
 
-def _distances(charts: tuple[_Chart, _Chart], i: Index, j: Index, config: MapMatching) -> Array:
+def _distances(charts: tuple[_Chart, _Chart], i: Rows, j: Rows, config: MapMatching) -> Array:
     """d_G [m] of Gaussians i of the first chart and j of the second."""
     a, b = charts
     out = np.empty(len(i))
-    thick_a, thick_b = (~np.any(x.held != 0, axis=(1, 2)) for x in (a, b))
-    for start in range(0, len(i), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for part in row_blocks(len(i)):
         delta = a.theta[i[part]] - b.theta[j[part]]
-        shape = _without(delta[:, LOG_COVARIANCE], a.held[i[part]] * thick_b[j[part], None, None])
-        shape = _without(shape, b.held[j[part]] * thick_a[i[part], None, None])
+        shape = _without(delta[:, LOG_COVARIANCE], a.held[i[part]] * b.thick[j[part], None, None])
+        shape = _without(shape, b.held[j[part]] * a.thick[i[part], None, None])
         out[part] = np.sqrt(
             np.sum(delta[:, MEAN] ** 2, axis=1) / config.position_scale_m**2
             + config.beta_log_covariance * np.sum(shape**2, axis=1)
@@ -174,17 +177,18 @@ class _Both:
     own: Placed
     peer: Placed
     charts: tuple[_Chart, _Chart]
-    candidates: tuple[Index, Index]
+    candidates: tuple[Rows, Rows]
     neighbors: tuple[Index, Index]
 
     @staticmethod
     def of(own: Placed, peer: Placed, config: MapMatching) -> _Both:
         nobody = np.zeros(0, np.int64)
+        candidates = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
         return _Both(
             own,
             peer,
             (_Chart.of(own.theta, config), _Chart.of(peer.theta, config)),
-            _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config),
+            candidates,
             (nobody, nobody) if len(own) < 2 else _neighbors(own.theta[:, MEAN], config.radius_m),
         )
 
@@ -201,43 +205,46 @@ class _Both:
         own, peer = self.own, self.peer
         i, j = self.candidates
         d = _distances(self.charts, i, j, config)
-        close = d < _threshold(self.charts[0], *self.neighbors, config)
-        i, j, d = i[close], j[close], d[close]
-        best_of_own = _first_of_each(i, d, peer.ids[j])
-        best_of_peer = _first_of_each(j, d, own.ids[i])
+        limit = _threshold(self.charts[0], *self.neighbors, config)
+        best_of_own = _best_of_each(i, d, limit, lambda at: peer.ids[j[at]])
+        best_of_peer = _best_of_each(j, d, limit, lambda at: own.ids[i[at]])
         mutual = np.intersect1d(best_of_own, best_of_peer)
         pairs = np.stack([own.ids[i[mutual]], peer.ids[j[mutual]]], axis=1)
         return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
-def _candidates(means_own: Array, means_peer: Array, config: MapMatching) -> tuple[Index, Index]:
+def _candidates(means_own: Array, means_peer: Array, config: MapMatching) -> tuple[Rows, Rows]:
     """Rows (own, peer) within the radius: the nearest few of either side, each pair once."""
-    found = []
+    n, m, k = len(means_own), len(means_peer), config.candidates
+    key, count = np.empty(n * min(k, m) + m * min(k, n), np.int64), 0
     for a, b, turned in ((means_own, means_peer, False), (means_peer, means_own, True)):
-        ranks, tree = [*range(1, min(config.candidates, len(b)) + 1)], cKDTree(b)
+        ranks, tree = [*range(1, min(k, len(b)) + 1)], cKDTree(b)
         for rows in row_blocks(len(a)):
             distance, neighbor = tree.query(a[rows], k=ranks, distance_upper_bound=config.radius_m)
             row, rank = np.nonzero(np.isfinite(distance))
             row, column = row + rows.start, neighbor[row, rank]
             own, peer = (column, row) if turned else (row, column)
-            found.append(own * len(means_peer) + peer)
-    key = np.concatenate(found)
-    del found
+            key[count : count + len(own)] = own * m + peer
+            count += len(own)
+    key = key[:count]
     key.sort()
-    key = key[np.diff(key, prepend=-1) > 0]
-    return key // len(means_peer), key % len(means_peer)
+    first = np.ones(count, bool)
+    np.not_equal(key[1:], key[:-1], out=first[1:])
+    key = key[first]
+    row_type = np.int32 if max(n, m) < 1 << 31 else np.int64
+    i: Rows = in_blocks(lambda of: (of // m).astype(row_type), key)
+    j: Rows = in_blocks(lambda of: (of % m).astype(row_type), key)
+    return i, j
 
 
-def _first_of_each(group: Index, d: Array, tie: Index) -> Index:
-    """Position of the least (d, tie) of every group."""
+def _best_of_each(group: Rows, d: Array, limit: float, tie: Callable[[Index], Index]) -> Index:
+    """Positions, ascending by group, of the least (d, tie) of every group that has a d below the limit."""
     if not len(group):
         return np.zeros(0, np.int64)
-    order = np.argsort(group, kind="stable")
-    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    sorted_d = d[order]
-    least = np.minimum.reduceat(sorted_d, starts)
-    nearest = order[sorted_d == np.repeat(least, np.diff(starts, append=len(order)))]
-    nearest = nearest[np.lexsort((tie[nearest], group[nearest]))]
+    least = np.full(int(group.max()) + 1, limit)
+    np.minimum.at(least, group, d)
+    nearest = np.flatnonzero(in_blocks(lambda g, x: (x == least[g]) & (x < limit), group, d))
+    nearest = nearest[np.lexsort((tie(nearest), group[nearest]))]
     return nearest[np.diff(group[nearest], prepend=-1) > 0]
 
 

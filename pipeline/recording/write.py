@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from duagc import schemas
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.shelf import SHELF
+from duagc.pipeline.base.shelf import LARGE_BYTES, SHELF
 from duagc.pipeline.recording.access import check_write
 from duagc.pipeline.recording.identity import ContentDigest, channel_identity
 from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, ROBOT_KEY
@@ -21,8 +21,6 @@ from duagc.pipeline.recording.read import LogFile, Record
 from duagc.schemas import topics as topic_table
 
 CHUNK_BYTES = 1 << 20
-LARGE_BYTES = 32 << 20
-"""Of a message: the map of a long log."""
 
 
 def mcap_writer(stream: IO[bytes]) -> Writer:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, new_file
-from duagc.pipeline.base.shelf import SHELF
+from duagc.pipeline.base.shelf import LARGE_BYTES, SHELF
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
 
@@ -66,6 +66,8 @@ def write_session_result(path: Path, result: SessionResult) -> None:
         for number, array in enumerate(arrays.arrays):
             with file.open(f"{number}.npy", "w", force_zip64=True) as stream:
                 np.lib.format.write_array(stream, _narrowed(array), allow_pickle=False)
+            if array.nbytes > LARGE_BYTES:
+                SHELF.sweep(heap=True)
 
 
 def read_session_result(path: Path) -> SessionResult:
