@@ -57,14 +57,21 @@ class ColorMap:
         """Colors [n, 3] of the other camera as this one shows them."""
         return np.asarray((colors - self.offset) / self.gain, dtype=np.float64)
 
+    def parameters(self, evidence: Evidence) -> Array:
+        """theta [n, 13] of evidence in the other camera's colors."""
+        if self.is_identity:
+            return evidence.theta
+        theta = evidence.theta.copy()
+        theta[:, COLOR] = self.to_other(theta[:, COLOR])
+        return theta
+
     def of(self, evidence: Evidence) -> Evidence:
         """Evidence in the other camera's colors; every bit is kept by the identity."""
         if self.is_identity:
             return evidence
-        theta, information = evidence.theta.copy(), evidence.information.copy()
-        theta[:, COLOR] = self.to_other(theta[:, COLOR])
+        information = evidence.information.copy()
         information[:, COLOR_INFORMATION] /= self.gain**2
-        return replace(evidence, theta=theta, information=information)
+        return replace(evidence, theta=self.parameters(evidence), information=information)
 
 
 @dataclass(frozen=True)

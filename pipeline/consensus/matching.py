@@ -255,11 +255,13 @@ def without(pairs: Index, left_out: Index) -> Index:
         pairs: int64 [n, 2], ids.
         left_out: int64 [m, 2], likewise.
     """
-    others = set(map(tuple, left_out.tolist()))
-    if not others:
+    if not len(left_out):
         return pairs
-    keep = [tuple(pair) not in others for pair in pairs.tolist()]
-    left: Index = pairs[np.array(keep, dtype=bool)]
+    both = np.concatenate([left_out, pairs])
+    order = np.lexsort((both[:, 1], both[:, 0]))
+    number = np.empty(len(both), np.int64)  # the same of equal pairs
+    number[order] = np.cumsum(np.any(np.diff(both[order], axis=0, prepend=both[order[:1]]), axis=1))
+    left: Index = pairs[~np.isin(number[len(left_out) :], number[: len(left_out)])]
     return left
 
 

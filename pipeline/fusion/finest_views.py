@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.context import MapContext
@@ -61,15 +62,13 @@ def from_finest_views(
     """
     own_rows = np.flatnonzero(fused.source == fused.robots.index(robot))
     maps = {robot: fused.gaussians.select(own_rows)}
-    information: dict[str, Array] = {}
-    for name in sorted(evidence):
-        if len(evidence[name]):
-            theirs = fused.colors[name].of(evidence[name])
-            maps[name] = gaussians_of(theirs.ids, theirs.anchors, theirs.theta)
-            information[name] = theirs.information
-    peers = sorted(information)
+    peers = [name for name in sorted(evidence) if len(evidence[name])]
     if not peers:
         return FinalStart.of_fused(fused)
+    for name in peers:
+        theirs = evidence[name]
+        maps[name] = gaussians_of(theirs.ids, theirs.anchors, fused.colors[name].parameters(theirs))
+    SHELF.sweep(heap=True)
     found = _resolutions(
         maps, robot, T_world_keyframe, context=context, depth_images=depth_images, depth_kinds=depth_kinds
     )
@@ -83,7 +82,7 @@ def from_finest_views(
             taken &= np.trace(mean_block(evidence[name].information), axis1=-2, axis2=-1) > 0
         rows = np.flatnonzero(taken)
         parts.append(maps[name].select(rows).replace(ids=next_id + np.arange(len(rows))))
-        stated.append(information[name][rows])
+        stated.append(fused.colors[name].of(evidence[name].select(rows)).information)
         next_id += len(rows)
     return FinalStart(Gaussians.concatenate(parts), np.concatenate(stated))
 

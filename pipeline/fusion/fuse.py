@@ -261,7 +261,10 @@ def _summed(information: Array, member: Index, first: Index) -> Array:
 
 def _information(team: TeamEvidence, matched: _Tracks, rows: Index) -> Array:
     """Information [n, 31] of some rows, summed over the members of those that stand for a track."""
-    information = team.information[rows]
+    information = np.empty((len(rows), INFORMATION_SIZE))
+    for some in row_blocks(len(rows)):
+        information[some] = team.information[rows[some]]
+        SHELF.sweep()
     places, track = matched.among(rows)
     for some in row_blocks(len(places)):
         information[places[some]] = matched.information[track[some]]

@@ -108,7 +108,11 @@ class ValidatedPeers:
     @property
     def uncontradicted(self) -> dict[str, Evidence]:
         """By name, in order, the evidence without what own images contradict."""
-        return {name: e.select(~self.contradicted[name]) for name, e in sorted(self.evidence.items())}
+        against = self.contradicted
+        return {
+            name: SHELF.put(e.select(~against[name])) if against[name].any() else e
+            for name, e in sorted(self.evidence.items())
+        }
 
 
 def validate_peer_maps(

@@ -73,10 +73,10 @@ def _views(
     kind = context.config.finetune.peer_pixels
     for number, (name, T_world_camera) in enumerate(chosen):
         if name != drawn:
-            own_colors = colors[name].of(evidence[name])
-            gaussians, drawn = gaussians_of(own_colors.ids, own_colors.anchors, own_colors.theta), name
+            peer, drawn = evidence[name], name
+            gaussians = gaussians_of(peer.ids, peer.anchors, colors[name].parameters(peer))
             if kind not in ("covered", "random"):
-                sigma_m, _ = sigma_along(own_colors.position_information(), gaussians.normals())
+                sigma_m, _ = sigma_along(peer.position_information(), gaussians.normals())
         T_camera_world = se3.inverse(T_world_camera)
         render = rasterizer.forward(gaussians, context.camera, T_camera_world, depth_kind=depth_kinds[name])
         seen = render.alpha >= COVERED

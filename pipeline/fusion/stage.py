@@ -166,15 +166,17 @@ def _untrained(
         arrived=result.arrived,
     )
     SHELF.sweep(heap=True)
-    own_information = self_information(
-        own.robot, own.gaussians, own.information, own.T_map_keyframe, kind=context.weights
+    own_information = SHELF.put(
+        self_information(own.robot, own.gaussians, own.information, own.T_map_keyframe, kind=context.weights)
     )
+    own_information = SHELF.put(in_world(own_information, poses[own.robot], context.weights))
+    SHELF.sweep(heap=True)
     fused = fuse(
         OwnMap(own.robot, own.gaussians, own.T_map_keyframe, poses[own.robot]),
         {own.robot: mine, **valid.evidence},
         valid.pairs,
         context,
-        self_information=SHELF.put(in_world(own_information, poses[own.robot], context.weights)),
+        self_information=own_information,
         depth_images=_depth_images(own),
         contradicted=valid.contradicted,
     )

@@ -15,7 +15,7 @@ from duagc.pipeline.consensus.colors import TeamColors, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import Pairs
 from duagc.pipeline.fusion.context import MapContext
-from duagc.pipeline.splat.information import INFORMATION_SIZE, THETA_SIZE
+from duagc.pipeline.splat.information import INFORMATION_SIZE
 
 Index = NDArray[np.int64]
 
@@ -55,16 +55,18 @@ class TeamEvidence:
         names = tuple(sorted(evidence))
         cameras = team_colors(evidence, pairs, context.matching.colors)
         start = np.concatenate([[0], np.cumsum([len(evidence[n]) for n in names])]).astype(np.int64)
-        theta = np.empty((start[-1], THETA_SIZE))
         information = np.empty((start[-1], INFORMATION_SIZE))
         for k, name in enumerate(names):
             for rows in row_blocks(len(evidence[name])):
                 part = slice(start[k] + rows.start, start[k] + rows.stop)
-                common = cameras.to_common(name).of(evidence[name].select(rows))
-                theta[part], information[part] = common.theta, common.information
-            # of a long log each of these is some hundred megabytes, and not looked at again
-            SHELF.sweep(heap=True)
-        theta, information = SHELF.put((theta, information))
+                information[part] = cameras.to_common(name).of(evidence[name].select(rows)).information
+                SHELF.sweep()  # of a long log these are some hundred megabytes, and not looked at again
+        information = SHELF.put(information)
+        SHELF.sweep(heap=True)
+        of_robots = [cameras.to_common(name).parameters(evidence[name]) for name in names]
+        theta = SHELF.put(np.concatenate(of_robots))
+        del of_robots
+        SHELF.sweep(heap=True)
         common_evidence = {
             n: replace(
                 evidence[n],

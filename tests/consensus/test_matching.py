@@ -233,3 +233,23 @@ def test_a_tilt_counts_even_between_discs_at_the_floor():
     little, corner = gaussian_distance(e, np.array([0, 0]), e, np.array([1, 2]), config=CONFIG)
     assert little < 0.3
     assert corner > 1.0
+
+
+@pytest.mark.parametrize("most", [3, 1 << 40])
+def test_pairs_without_others_are_those_of_a_set(most):
+    rng = np.random.default_rng(0)
+    pairs, others = rng.integers(0, most, (40, 2)), rng.integers(0, most, (5, 2))
+    others = np.concatenate([others, pairs[[3, 17]]])
+    out = {tuple(pair) for pair in others.tolist()}
+    expected = [pair for pair in pairs.tolist() if tuple(pair) not in out]
+    assert matching.without(pairs, others).tolist() == expected
+    assert matching.without(pairs, others[:0]).tolist() == pairs.tolist()
+    assert not len(matching.without(pairs[:0], others))
+
+
+def test_the_best_of_each_is_the_least_and_of_equal_ones_that_of_the_least_tie():
+    group = np.array([0, 0, 2, 2, 2, 3])
+    d = np.array([0.5, 0.5, 0.3, 0.2, 0.9, 1.0])
+    tie = np.array([7, 4, 1, 2, 3, 9])
+    assert matching._best_of_each(group, d, 1.0, lambda at: tie[at]).tolist() == [1, 3]
+    assert not len(matching._best_of_each(group, d, 0.1, lambda at: tie[at]))
