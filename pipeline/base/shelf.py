@@ -27,7 +27,7 @@ LEAST_BYTES = 64 << 10
 MOST_FILES = 1 << 16
 """Open files that are asked for, if the system allows so many."""
 LARGE_BYTES = 32 << 20
-"""Of something that is written: an array or a map of a long log. What else can be given back then, is."""
+"""Arrays and messages of more are those of long logs: memory is given back while they are written."""
 SWEEP_AFTER = 16
 """Objects, after which all pages are given back that were looked at since."""
 

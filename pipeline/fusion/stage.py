@@ -166,10 +166,10 @@ def _untrained(
         arrived=result.arrived,
     )
     SHELF.sweep(heap=True)
-    own_information = SHELF.put(
+    in_map = SHELF.put(
         self_information(own.robot, own.gaussians, own.information, own.T_map_keyframe, kind=context.weights)
     )
-    own_information = SHELF.put(in_world(own_information, poses[own.robot], context.weights))
+    own_information = SHELF.put(in_world(in_map, poses[own.robot], context.weights))
     SHELF.sweep(heap=True)
     fused = fuse(
         OwnMap(own.robot, own.gaussians, own.T_map_keyframe, poses[own.robot]),
