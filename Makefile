@@ -50,7 +50,7 @@ demo: setup
 
 # A test that does not end is said, with what every thread was at, instead of being waited for.
 test: setup
-	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadgroup -o faulthandler_timeout=300 -o faulthandler_exit_on_timeout=true $(TEST_OPTIONS)
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadscope --no-loadscope-reorder -o faulthandler_timeout=300 -o faulthandler_exit_on_timeout=true $(TEST_OPTIONS)
 
 # Four runs made again and compared, message by message, with what is stored under tests/golden.
 golden: setup

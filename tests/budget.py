@@ -129,12 +129,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of a folder share the fixtures of a session: one worker of pytest-xdist runs them all."""
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(folder_of(item.nodeid)))
-
-
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Meter(), "processor-time-meter")
     if not hasattr(

@@ -13,7 +13,7 @@ determinism.configure_determinism()
 # would be waiting, and a thread that waits awake counts as processor time.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-pytest_plugins = ["tests.budget", "tests.fixtures.small_run"]
+pytest_plugins = ["tests.budget", "tests.distribution", "tests.fixtures.small_run"]
 
 
 @pytest.fixture(scope="session", autouse=True)
