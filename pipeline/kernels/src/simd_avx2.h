@@ -85,6 +85,13 @@ inline void store4x4(float* p, size_t stride, Vec x) {
     _mm_storeu_ps(p + 2 * stride, _mm256_castps256_ps128(x.b));
     _mm_storeu_ps(p + 3 * stride, _mm256_extractf128_ps(x.b, 1));
 }
+inline Vec look_up4x4(const float* table, const uint8_t* p, size_t stride) {
+    const auto row = [&](size_t r) ALWAYS_INLINE {
+        const uint8_t* v = p + r * stride;
+        return _mm_setr_ps(table[3 * v[0]], table[3 * v[3]], table[3 * v[6]], table[3 * v[9]]);
+    };
+    return {_mm256_set_m128(row(1), row(0)), _mm256_set_m128(row(3), row(2))};
+}
 template <int A, int B, int C, int D>
 inline Vec permute4(Vec x) {
     constexpr int order = A | B << 2 | C << 4 | D << 6;

@@ -60,6 +60,15 @@ inline void store4x4(float* p, size_t stride, Vec a) {
     _mm_storeu_ps(p + 2 * stride, _mm512_extractf32x4_ps(a.v, 2));
     _mm_storeu_ps(p + 3 * stride, _mm512_extractf32x4_ps(a.v, 3));
 }
+// table[3 v] of the bytes v of four rows of four, 3 apart within a row and `stride` from row to row.
+inline Vec look_up4x4(const float* table, const uint8_t* p, size_t stride) {
+    const auto row = [&](size_t r) ALWAYS_INLINE {
+        const uint8_t* v = p + r * stride;
+        return _mm_setr_ps(table[3 * v[0]], table[3 * v[3]], table[3 * v[6]], table[3 * v[9]]);
+    };
+    const __m256 top = _mm256_set_m128(row(1), row(0)), bottom = _mm256_set_m128(row(3), row(2));
+    return _mm512_insertf32x8(_mm512_castps256_ps512(top), bottom, 1);
+}
 // Within every four lanes: the elements A, B, C, D.
 template <int A, int B, int C, int D>
 inline Vec permute4(Vec a) {

@@ -109,6 +109,11 @@ inline Vec load4x4(const float* p, size_t stride) {
 inline void store4x4(float* p, size_t stride, Vec x) {
     unrolled<4>([&](auto k) ALWAYS_INLINE { vst1q_f32(p + k * stride, x.q[k]); });
 }
+inline Vec look_up4x4(const float* table, const uint8_t* p, size_t stride) {
+    alignas(64) float lanes[LANES];
+    for (size_t lane = 0; lane < LANES; lane++) lanes[lane] = table[3 * p[lane / 4 * stride + lane % 4 * 3]];
+    return load(lanes);
+}
 template <int A, int B, int C, int D>
 inline Vec permute4(Vec x) {
     return quarters<Vec>([&](int k) ALWAYS_INLINE { return float32x4_t{x.q[k][A], x.q[k][B], x.q[k][C], x.q[k][D]}; });

@@ -125,6 +125,11 @@ inline Vec load4x4(const float* p, size_t stride) {
 inline void store4x4(float* p, size_t stride, Vec a) {
     for (int i = 0; i < LANES; i++) p[i / 4 * stride + i % 4] = a.v[i];
 }
+inline Vec look_up4x4(const float* table, const uint8_t* p, size_t stride) {
+    alignas(64) float lanes[LANES];
+    for (size_t lane = 0; lane < LANES; lane++) lanes[lane] = table[3 * p[lane / 4 * stride + lane % 4 * 3]];
+    return load(lanes);
+}
 template <int A, int B, int C, int D>
 inline Vec permute4(Vec a) {
     constexpr int from[4] = {A, B, C, D};

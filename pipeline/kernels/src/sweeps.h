@@ -66,7 +66,7 @@ struct Sweep {
             if (!frame.one_row)
                 std::memcpy(out, row, ROW * sizeof(float));
             else if (any_nonzero<ROW>(row))
-                for (int k = 0; k < ROW; k++) out[k] += row[k];
+                add_row<ROW>(out, row);
         }
     }
 
@@ -74,6 +74,13 @@ private:
     Sweep(Frame& frame, const Tile& t, float* tile_rows)
         : view(frame.view), tile(t), splats(gather_splats(frame, t)), rows(tile_rows), items(frame, t.index) {}
 
+    template <int ROW>
+    static void add_row(float* out, const float* row) {
+        if constexpr (ROW % LANES == 0)
+            for (int first = 0; first < ROW; first += LANES) store(out + first, load(out + first) + load(row + first));
+        else
+            for (int k = 0; k < ROW; k++) out[k] += row[k];
+    }
     template <int ROW>
     static bool any_nonzero(const float* row) {
         bool zero = true;

@@ -87,15 +87,15 @@ inline void read_block_rgb(const float* image, const Block& block, const View& v
 }
 // The three planes of an image of bytes, by a table [256, 3] of what they stand for.
 inline void read_block_rgb(const uint8_t* image, const float* table, const Block& block, const View& view, Vec* rgb) {
-    alignas(64) float planes[3][LANES] = {};
-    const auto read = [&](int lane, size_t p) ALWAYS_INLINE {
-        for (int k = 0; k < 3; k++) planes[k][lane] = table[3 * image[3 * p + k] + k];
-    };
     if (block.whole) {
-        for (int lane = 0; lane < LANES; lane++) read(lane, block.pixel + static_cast<size_t>(lane / 4) * view.width + lane % 4);
-    } else {
-        block.for_each(view, read);
+        const uint8_t* p = image + 3 * block.pixel;
+        for (int k = 0; k < 3; k++) rgb[k] = look_up4x4(table + k, p + k, 3 * static_cast<size_t>(view.width));
+        return;
     }
+    alignas(64) float planes[3][LANES] = {};
+    block.for_each(view, [&](int lane, size_t p) {
+        for (int k = 0; k < 3; k++) planes[k][lane] = table[3 * image[3 * p + k] + k];
+    });
     for (int k = 0; k < 3; k++) rgb[k] = load(planes[k]);
 }
 inline void write_block_rgb(float* image, const Block& block, const View& view, const Vec* rgb) {
@@ -132,7 +132,8 @@ inline const Splat* gather_splats(Frame& frame, const Tile& tile) {
     Splat* copies = frame.tile_splats.data() + this_thread() * (frame.longest_list + 1);
     const Splat* splats = frame.splats.data();
     const uint32_t* list = frame.list_splats.data() + tile.first;
-    for (uint32_t i = 0; i < tile.count; i++) copies[i] = splats[list[i]];
+    static_assert(sizeof(Splat) == LANES * sizeof(float), "");
+    for (uint32_t i = 0; i < tile.count; i++) store(&copies[i].u, load(&splats[list[i]].u));
     copies[tile.count] = {};
     copies[tile.count].log2_opacity = -16.0f;
     return copies;

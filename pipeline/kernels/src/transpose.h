@@ -216,6 +216,17 @@ inline void load_columns8(Row row, Vec* columns) {
     transpose8(high);
     for (int i = 0; i < 8; i++) columns[i] = {low[i], high[i]};
 }
+// The numbers of the bits that are set in a byte, in order, and then zeros.
+struct BitPlaces {
+    alignas(8) uint8_t of[256][8];
+    constexpr BitPlaces() : of() {
+        for (int word = 0; word < 256; word++)
+            for (int bit = 0, found = 0; bit < 8; bit++)
+                if (word >> bit & 1) of[word][found++] = static_cast<uint8_t>(bit);
+    }
+};
+static constexpr BitPlaces BIT_PLACES;
+
 inline uint32_t positions_with_bit(const uint16_t* words, uint32_t count, int bit, uint32_t* out) {
     uint32_t found = 0;
     const __m256i test = _mm256_set1_epi16(static_cast<short>(1 << bit));
@@ -224,8 +235,14 @@ inline uint32_t positions_with_bit(const uint16_t* words, uint32_t count, int bi
         const __m256i word = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(words + i));
         const __m256i equal = _mm256_cmpeq_epi16(_mm256_and_si256(word, test), test);
         const __m128i bytes = _mm_packs_epi16(_mm256_castsi256_si128(equal), _mm256_extracti128_si256(equal, 1));
-        for (uint32_t hit = static_cast<uint32_t>(_mm_movemask_epi8(bytes)) & inside; hit; hit &= hit - 1)
-            out[found++] = i + static_cast<uint32_t>(__builtin_ctz(hit));
+        const uint32_t hits = static_cast<uint32_t>(_mm_movemask_epi8(bytes)) & inside;
+        for (int half = 0; half < 2; half++) {
+            const uint32_t hit = hits >> 8 * half & 0xff;
+            const __m128i places = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(BIT_PLACES.of[hit]));
+            const __m256i place = _mm256_add_epi32(_mm256_cvtepu8_epi32(places), _mm256_set1_epi32(static_cast<int>(i + 8 * half)));
+            _mm256_storeu_si256(reinterpret_cast<__m256i*>(out + found), place);
+            found += static_cast<uint32_t>(__builtin_popcount(hit));
+        }
     }
     return found;
 }
