@@ -31,8 +31,7 @@ from duagc.pipeline.bench import torch_tiles
 from duagc.pipeline.config.training import LossConfig
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels import _raster
-from duagc.pipeline.kernels.rasterizer import Rasterizer, available_isas
+from duagc.pipeline.kernels import Rasterizer, _raster, available_isas
 from duagc.pipeline.kernels.types import FisherSums, Gradients, LossWeights, Statistics
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.losses import rgbd_loss

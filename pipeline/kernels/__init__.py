@@ -9,7 +9,8 @@ except ImportError as error:
     ) from error
 
 from duagc.pipeline.kernels.adam import CompiledAdam
-from duagc.pipeline.kernels.rasterizer import Rasterizer, available_isas
+from duagc.pipeline.kernels.arguments import available_isas
+from duagc.pipeline.kernels.rasterizer import Rasterizer
 from duagc.pipeline.kernels.types import FisherSums, Gradients, LossWeights, Render, Statistics, ViewLoss
 
 __all__ = [

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import _raster
 from duagc.pipeline.kernels.types import FISHER_DIAGONAL_COLUMNS, FisherSums
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import GEOMETRY_SIZE
@@ -179,6 +180,22 @@ def check_sums(sums: object, n: int) -> None:
         expected["diagonal"] = ((n, FISHER_DIAGONAL_COLUMNS), np.float64)
     for name, (shape, dtype) in expected.items():
         check_array(f"sums.{name}", getattr(sums, name), shape, dtype)
+
+
+def available_isas() -> list[str]:
+    """Builds that this processor can run, fastest first: "avx512", "avx2", "neon", "portable"."""
+    return list(_raster.available_isas())
+
+
+def checked_isa(isa: object) -> str:
+    """The name of an instruction set that this processor has, or "auto".
+
+    Args:
+        isa: as it was given.
+    """
+    if not isinstance(isa, str) or isa not in ("auto", *available_isas()):
+        raise ValueError(f"isa is {isa!r}, available here: auto, {', '.join(available_isas())}")
+    return isa
 
 
 def checked_threads(threads: object) -> int:

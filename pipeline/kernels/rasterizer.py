@@ -27,6 +27,7 @@ from duagc.pipeline.kernels.arguments import (
     checked_camera,
     checked_exposure,
     checked_image,
+    checked_isa,
     checked_mask,
     checked_pose,
     checked_threads,
@@ -53,11 +54,6 @@ _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)
 
 
-def available_isas() -> list[str]:
-    """Builds that this processor can run, fastest first: "avx512", "avx2", "neon", "portable"."""
-    return list(_raster.available_isas())
-
-
 class Rasterizer:
     """Draws Gaussians into a camera, and takes derivatives back to them.
 
@@ -75,11 +71,9 @@ class Rasterizer:
         Raises:
             ValueError: an instruction set that this machine lacks, or a number of threads out of range.
         """
-        if not isinstance(isa, str) or isa not in ("auto", *available_isas()):
-            raise ValueError(f"isa is {isa!r}, available here: auto, {', '.join(available_isas())}")
         checked_threads(threads)
         self.threads = threads
-        self._raster = _raster.Raster(isa)
+        self._raster = _raster.Raster(checked_isa(isa))
         self._gaussians: Gaussians | None = None
         self._closed_early = False
         self._size = (0, 0)
