@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.evaluation.image_metrics import decibels
 from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
 from duagc.pipeline.splat.losses import Rendered
 
@@ -117,7 +118,7 @@ def fitted_psnr(
         squares = _squared_errors((color, render.alpha, seen), scored, other, covered=covered)
         if isinstance(squares, Absent):
             return squares
-        squares = squares if whole else squares[:, counted[:, scored]]
+        squares = squares if whole else masks.taken(squares, counted[:, scored])
         sums.append(float(np.sum(squares, dtype=np.float64)))
         counts.append(squares.size)
     if not all(counts):

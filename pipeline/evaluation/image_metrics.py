@@ -39,7 +39,7 @@ def psnr_of_planes(
     """
     error = np.clip(rendered, 0, 1) - reference
     if mask is not None and not mask.all():
-        error = error[:, mask]
+        error = masks.taken(error, mask)
     return decibels(float(np.mean(np.square(error, out=error), dtype=np.float64)))
 
 
@@ -128,7 +128,7 @@ class _Scale:
             if not self.counted.any():
                 raise ValueError("no 11x11 window of SSIM has usable pixels only")
             if not self.counted.all():
-                images = [image[self.counted] for image in images]
+                images = [masks.taken_pixels(image, self.counted) for image in images]
         means = [float(np.mean(image, dtype=np.float64)) for image in images]
         return means[-1], means[0]
 

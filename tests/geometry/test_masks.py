@@ -90,3 +90,13 @@ def test_a_picture_shows_squares_of_gray_where_it_is_masked() -> None:
     assert (shown[:, :16] == 50).all()
     assert set(np.unique(shown[:, 16:])) == set(masks.CHECKER)
     assert masks.checkered(image, None) is image
+
+
+@given(st.integers(0, 1000), st.floats(0.0, 1.0))
+@settings(deadline=None, max_examples=30)
+def test_what_usable_pixels_show_is_taken_in_their_order(seed: int, share: float) -> None:
+    mask = mask_of(seed, share=share)
+    planes = np.random.default_rng(seed + 1).random((3, *mask.shape), dtype=np.float32)
+    assert np.array_equal(masks.taken(planes, mask), planes[:, mask])
+    image = np.moveaxis(planes, 0, -1)
+    assert np.array_equal(masks.taken_pixels(image, mask), image[mask])
