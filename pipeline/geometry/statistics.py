@@ -14,7 +14,7 @@ def mad_sigma(deviations: NDArray[np.floating]) -> float:
     Args:
         deviations: from the center, of any sign, any shape.
     """
-    return MAD_TO_SIGMA * median(np.abs(deviations))
+    return MAD_TO_SIGMA * median_in_place(np.abs(deviations).ravel())
 
 
 def median(values: NDArray[np.floating]) -> float:
@@ -23,13 +23,21 @@ def median(values: NDArray[np.floating]) -> float:
     Args:
         values: any shape, at least one value.
     """
-    flat = values.ravel()
-    middle, odd = divmod(flat.size, 2)
-    ordered = np.partition(flat, middle)  # one place: several take five times as long
-    above = ordered[middle:]
+    return median_in_place(values.flatten())
+
+
+def median_in_place(values: NDArray[np.floating]) -> float:
+    """The same of numbers that are needed no more: no second copy of them is made.
+
+    Args:
+        values: [n], at least one; left in another order.
+    """
+    middle, odd = divmod(values.size, 2)
+    values.partition(middle)  # one place: several take five times as long
+    above = values[middle:]
     if np.isnan(above.max()):  # NaN is the largest
         return float("nan")
-    return float(above[0] if odd else (ordered[:middle].max() + above[0]) / flat.dtype.type(2))
+    return float(above[0] if odd else (values[:middle].max() + above[0]) / values.dtype.type(2))
 
 
 def mad_sigmas(deviations: NDArray[np.float64]) -> NDArray[np.float64]:

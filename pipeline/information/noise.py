@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.geometry.depth_noise import NEAREST_M, DepthNoise
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.geometry.statistics import mad_sigma
+from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA, mad_sigma, median_in_place
 from duagc.pipeline.information.views import MapViews
 
 CORRELATION_VIEWS = 8
@@ -82,22 +83,28 @@ def estimate_noise(views: MapViews, config: InformationConfig, *, every: int = 4
         alpha, z = render.alpha[sample].astype(np.float64), image.depth_m[sample].astype(np.float64)
         covered = alpha > 0.9
         difference = render.color[sample].astype(np.float64) - _colors(image)[sample]
-        colors.append(np.abs(difference[covered]).ravel())
+        colors.append(SHELF.put(np.abs(difference[covered]).ravel()))
         both = covered & (z > 0)
         residual = render.depth[sample][both] / alpha[both] - z[both]
         logged_m = None if image.depth_sigma_m is None else image.depth_sigma_m[sample][both]
-        depths.append(np.abs(residual) / unit.depth_sigma_m(z[both], logged_m))
-    color, units = np.concatenate(colors), np.concatenate(depths)
-    color_sigma = mad_sigma(color) if len(color) else 0.0
+        depths.append(SHELF.put(np.abs(residual) / unit.depth_sigma_m(z[both], logged_m)))
+    color_sigma = _spread(colors) or 0.0
     factor = 1.0
-    if config.depth_factor_from_residuals and len(units):
-        factor = mad_sigma(units)
-        factor = float(np.clip(factor, config.depth_factor_min, config.depth_factor_max))
+    if config.depth_factor_from_residuals and (spread := _spread(depths)) is not None:
+        factor = float(np.clip(spread, config.depth_factor_min, config.depth_factor_max))
     return ImageNoise(
         color_sigma=max(color_sigma, config.color_sigma_floor),
         depth=replace(model, factor=factor),
         from_log=any(image.depth_sigma_m is not None for image in views.images),
     )
+
+
+def _spread(parts: list[NDArray[np.float64]]) -> float | None:
+    """Robust standard deviation of absolute residuals in parts, which are given up; None without any."""
+    values = np.concatenate(parts)
+    parts.clear()
+    SHELF.sweep(heap=True)
+    return MAD_TO_SIGMA * median_in_place(values) if len(values) else None
 
 
 def _in_blocks(side_px: int, every: int) -> NDArray[np.int64]:
