@@ -225,12 +225,15 @@ def _fuse_tracks(
 
     move = np.zeros((len(first), THETA_SIZE))
     if len(first):
-        theta, information = team.theta[member], team.information[member]
-        mine = np.flatnonzero(found.robot == me)
+        theta, information = _of_members(team, member)
         if context.config.association == "neighbors":
+            mine = np.flatnonzero(found.robot == me)
             common = team.cameras.to_common(team.robot)
-            splats = common.of(self_information.select(found.row[mine]))
-            theta[mine], information[mine] = splats.theta, splats.information
+            for some in row_blocks(len(mine)):
+                rows = mine[some]
+                splats = common.of(self_information.select(found.row[rows]))
+                theta[rows], information[rows] = splats.theta, splats.information
+                SHELF.sweep()
         tracked = TrackMembers(EvidenceRows(*SHELF.put((theta, information))), reference, first)
         del theta, information
         SHELF.sweep(heap=True)
@@ -246,6 +249,15 @@ def _fuse_tracks(
         information,
         absorbed,
     )
+
+
+def _of_members(team: TeamEvidence, member: Index) -> tuple[Array, Array]:
+    """theta [n, 13] and information [n, 31] of the members of tracks."""
+    theta, information = np.empty((len(member), THETA_SIZE)), np.empty((len(member), INFORMATION_SIZE))
+    for some in row_blocks(len(member)):
+        theta[some], information[some] = team.theta[member[some]], team.information[member[some]]
+        SHELF.sweep()  # of a long log these are some hundred megabytes, here and there
+    return theta, information
 
 
 def _summed(information: Array, member: Index, first: Index) -> Array:
