@@ -225,7 +225,7 @@ def _fuse_tracks(
 
     move = np.zeros((len(first), THETA_SIZE))
     if len(first):
-        theta, information = _of_members(team, member)
+        theta, information = _gathered(team.theta, member), _gathered(team.information, member)
         if context.config.association == "neighbors":
             mine = np.flatnonzero(found.robot == me)
             common = team.cameras.to_common(team.robot)
@@ -251,13 +251,13 @@ def _fuse_tracks(
     )
 
 
-def _of_members(team: TeamEvidence, member: Index) -> tuple[Array, Array]:
-    """theta [n, 13] and information [n, 31] of the members of tracks."""
-    theta, information = np.empty((len(member), THETA_SIZE)), np.empty((len(member), INFORMATION_SIZE))
-    for some in row_blocks(len(member)):
-        theta[some], information[some] = team.theta[member[some]], team.information[member[some]]
-        SHELF.sweep()  # of a long log these are some hundred megabytes, here and there
-    return theta, information
+def _gathered(array: Array, rows: Index) -> Array:
+    """Rows [n, k] of an array that lies in a file, block by block: of a long log these are some hundred megabytes."""
+    out = np.empty((len(rows), array.shape[1]))
+    for some in row_blocks(len(rows)):
+        out[some] = array[rows[some]]
+        SHELF.sweep()
+    return out
 
 
 def _summed(information: Array, member: Index, first: Index) -> Array:
@@ -273,10 +273,7 @@ def _summed(information: Array, member: Index, first: Index) -> Array:
 
 def _information(team: TeamEvidence, matched: _Tracks, rows: Index) -> Array:
     """Information [n, 31] of some rows, summed over the members of those that stand for a track."""
-    information = np.empty((len(rows), INFORMATION_SIZE))
-    for some in row_blocks(len(rows)):
-        information[some] = team.information[rows[some]]
-        SHELF.sweep()
+    information = _gathered(team.information, rows)
     places, track = matched.among(rows)
     for some in row_blocks(len(places)):
         information[places[some]] = matched.information[track[some]]
