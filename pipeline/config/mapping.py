@@ -33,7 +33,7 @@ class TrainingSteps(NamedTuple):
 
 STEPS: dict[DepthKind, TrainingSteps] = {
     "ray_plane": TrainingSteps(keyframe=32, final=64, final_view=16),
-    "blended": TrainingSteps(keyframe=24, final=76, final_view=19),
+    "blended": TrainingSteps(keyframe=8, final=76, final_view=19),
 }
 """Where nothing else is set. On exact depth a step at a keyframe is worth more than one at the end."""
 
@@ -102,7 +102,7 @@ class MappingConfig(Config):
     random_keyframes: int = 2
     """Older keyframes added to the window at random, against forgetting."""
     iterations: int | None = Field(default=None, ge=0)
-    """Optimization steps (one view each) at a keyframe; every second one is on the newest keyframe. None: 24, or
+    """Optimization steps (one view each) at a keyframe; every second one is on the newest keyframe. None: 8, or
     32 where depth is exact."""
     iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""

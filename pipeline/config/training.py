@@ -58,14 +58,14 @@ class MapLossConfig(Config):
 
 
 class SparseStepsConfig(Config):
-    """What the steps of a training leave out until it nears its end."""
+    """What the steps of a training leave out."""
 
-    until: float = Field(default=0.85, ge=0.0, le=1.0)
-    """Share of the steps that leave something out; the others look at whole images, blended as they are drawn."""
     checkerboard: bool = True
     """Look at every second block of 4x4 pixels, and at the others when the view comes again."""
     closing: float = Field(default=0.005, ge=0.0, le=0.5)
     """The Gaussian that takes the light at a pixel below this share stops all that is left; 0: blend to the end."""
+    closing_until: float = Field(default=0.85, ge=0.0, le=1.0)
+    """Share of the steps that do so; the others blend as maps are drawn."""
     moving_from: float = Field(default=0.7, ge=0.0, le=1.0)
     """Share of the steps after which views whose camera moves while its shutter is open are drawn from several places,
     and by half of their blocks; 1: never."""

@@ -47,11 +47,11 @@ class MappingBudget:
             views: how many there are, keyframes too.
             log_s: time that the log took to record.
         """
-        config, sparse = self.config, self.config.sparse
+        config = self.config
         wanted = int(config.final_steps(keyframes, views, self.depth))
         if config.final_megapixels_s is None:
             return wanted, wanted
-        seen = 1 - 0.5 * sparse.until if sparse.checkerboard else 1.0
+        seen = 0.5 if config.sparse.checkerboard else 1.0
         pixels = seen * self.camera.width * self.camera.height
         return wanted, int(min(wanted, 1e6 * config.final_megapixels_s * log_s / pixels))
 

@@ -1,9 +1,9 @@
-"""Training steps that leave out what costs more than it brings, until the training nears its end.
+"""Training steps that leave out what costs more than it brings.
 
-Half of the 4x4 blocks of an image, in a checkerboard, tell nearly as much as all of them. And where hardly any light is
-left at a pixel, the Gaussians that share it say little; the one that takes the light below a limit stops it all.
-Views whose camera moves while its shutter is open are drawn as if it stood still at first, and by half of their blocks
-to the end: drawn from several places they take several times as long.
+Half of the 4x4 blocks of an image, in a checkerboard, tell as much as all of them. And where hardly any light is left
+at a pixel, the Gaussians that share it say little; until the training nears its end, the one that takes the light below
+a limit stops it all. Views whose camera moves while its shutter is open are drawn as if it stood still at first: drawn
+from several places they take several times as long.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class SparseSteps:
             steps: of the training, in all.
         """
         self._config = config
-        self._until = round(config.until * steps)
+        self._closing_until = round(config.closing_until * steps)
         self._moving_from = config.moving_from * steps
         self._boards = checkerboards(camera.height, camera.width)
 
@@ -79,10 +79,11 @@ class SparseSteps:
             visit: number that differs by one from one look at a view to the next, which sees the other half.
         """
         board = self._boards[visit % 2]
-        of_moving = board if step >= self._moving_from else None
-        if step >= self._until:
-            return LookedAt(of_moving=of_moving)
-        return LookedAt(board if self._config.checkerboard else None, self._config.closing, of_moving)
+        return LookedAt(
+            pixels=board if self._config.checkerboard else None,
+            closing=self._config.closing if step < self._closing_until else 0.0,
+            of_moving=board if step >= self._moving_from else None,
+        )
 
 
 def checkerboards(height: int, width: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

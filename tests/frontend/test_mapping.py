@@ -268,7 +268,7 @@ def test_what_was_seen_elsewhere_is_not_given_up_for_what_is_seen_now() -> None:
     covered = []
     for sweep in (2, 7):
         crowded = {"max_gaussians": 70, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
-        crowded |= {"max_scale_m": 0.2, "sparse": SparseStepsConfig(until=0.0)}
+        crowded |= {"max_scale_m": 0.2, "sparse": SparseStepsConfig(checkerboard=False, closing=0.0)}
         mapper = Mapper(CAMERA, QUICK.model_copy(update=crowded), seed=0)
         stats = [mapper.add_keyframe(k, *shot(pose), pose) for k, pose in enumerate(turns)]
         assert sum(s.pruned for s in stats) > 50

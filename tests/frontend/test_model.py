@@ -30,9 +30,8 @@ def image(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def room_map(seed: int) -> Gaussians:
     """The room from three places; the map frame is the keyframe's camera."""
-    whole = SparseStepsConfig(
-        until=0.0
-    )  # what is tested is the registration: the map is to be good in few steps
+    # what is tested is the registration: the map is to be good in few steps
+    whole = SparseStepsConfig(checkerboard=False, closing=0.0)
     config = MappingConfig(
         max_gaussians=20000, iterations=20, final_iterations=60, pose_rate=0.0, sparse=whole
     )

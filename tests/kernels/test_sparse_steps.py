@@ -20,18 +20,17 @@ def test_black_and_white_blocks_are_the_image() -> None:
     assert black[4:8, 4:8].all()
 
 
-def test_a_view_is_seen_by_halves_and_whole_at_the_end() -> None:
+def test_a_view_is_seen_by_halves_and_blended_to_the_end_at_last() -> None:
     mask = np.random.default_rng(0).random((18, 26)) < 0.7
     image = np.zeros((18, 26), np.float32)
-    steps = SparseSteps(SparseStepsConfig(until=0.5, closing=0.02), CAMERA, 10)
+    steps = SparseSteps(SparseStepsConfig(closing_until=0.5, closing=0.02), CAMERA, 10)
     for whole in (None, mask):
         view = TrainingView(np.zeros((18, 26, 3), np.float32), image, np.eye(4), whole)
-        first, second = (steps.at(step, visit).of(view) for step, visit in ((0, 3), (4, 4)))
+        first, second = (steps.at(step, visit).of(view) for step, visit in ((4, 3), (9, 4)))
         assert first.mask is not None
         assert second.mask is not None
         assert not (first.mask & second.mask).any()
         np.testing.assert_array_equal(first.mask | second.mask, np.ones_like(mask) if whole is None else mask)
-        assert steps.at(5, 5).of(view) is view
     assert steps.at(4, 0).closing == 0.02
     assert steps.at(5, 0).closing == 0
 
