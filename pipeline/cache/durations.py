@@ -22,9 +22,11 @@ TRACKING_S, POSES_S, MODEL_S = (0.005, 0.039), (0.007, 0.025), (0.001, 0.057)
 """Of a frame: in any case, and for every million pixels."""
 MOVED_S = 0.14
 """Of moving the depth of a frame, for every million pixels; every stage that reads a frame does it."""
+SEEDING_S = (0.0, 0.3)
+"""The same of what a keyframe seeds and prunes."""
 MAPPING_S = (0.0015, 0.086)
 """The same of a step of mapping, of which every keyframe takes some."""
-FINAL_S = (0.0032, 0.087)
+FINAL_S = (0.0030, 0.080)
 """The same of a step of the final optimization."""
 MAPPING_OF_TILES, FINAL_OF_TILES = 1.9, 1.7
 """By how much longer a step takes in a map of many tiles, whose views see Gaussians of others (docs/lab, length)."""
@@ -76,7 +78,9 @@ def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
         "start": START_S,
         "tracking": of(TRACKING_S) * frames + (of(TRACKING_S) * frames + moved if moved else 0.0),
         "poses": of(POSES_S) * frames + moved,
-        "mapping": of(MAPPING_S) * steps * keyframes * _longer(MAPPING_OF_TILES, size, mapping),
+        "mapping": (of(SEEDING_S) + of(MAPPING_S) * steps)
+        * keyframes
+        * _longer(MAPPING_OF_TILES, size, mapping),
         "final": of(FINAL_S) * _final_steps(size, mapping) * _longer(FINAL_OF_TILES, size, mapping),
         "model": of(MODEL_S) * frames + moved,
     }
