@@ -94,7 +94,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
 def followed(walk: Walk, kind: str, out: Path, mapping: bool) -> tuple[list, list, float]:
     """Tracked frames, the final map if there is one, and the ATE in meters."""
     config = FrontendConfig(mapping_enabled=mapping)
-    few = {"final_iterations": 5, "final_iterations_view": 0, "max_gaussians": 20_000}
+    few = {"final_iterations": 20, "final_iterations_view": 5, "max_gaussians": 20_000}
     quick = config.mapping.model_copy(update=few)
     run_frontend(walk.logs[kind], out, config.model_copy(update={"mapping": quick}))
     messages = [(record.topic, record.message()) for record in read_log(out)]
