@@ -35,7 +35,8 @@ STEPS: dict[DepthKind, TrainingSteps] = {
     "ray_plane": TrainingSteps(keyframe=32, final=64, final_view=16),
     "blended": TrainingSteps(keyframe=8, final=76, final_view=19),
 }
-"""Where nothing else is set. On exact depth a step at a keyframe is worth more than one at the end."""
+"""Where nothing else is set. On exact depth a step at a keyframe is worth more than one at the end; on noisy depth it
+is worth little (docs/lab, half-of-the-blocks)."""
 
 
 class SeedingConfig(Config):

@@ -94,9 +94,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
 def followed(walk: Walk, kind: str, out: Path, mapping: bool) -> tuple[list, list, float]:
     """Tracked frames, the final map if there is one, and the ATE in meters."""
     config = FrontendConfig(mapping_enabled=mapping)
-    few = {"final_iterations": 20, "final_iterations_view": 5, "max_gaussians": 20_000}
-    quick = config.mapping.model_copy(update=few)
-    run_frontend(walk.logs[kind], out, config.model_copy(update={"mapping": quick}))
+    small = config.mapping.model_copy(update={"max_gaussians": 20_000})
+    run_frontend(walk.logs[kind], out, config.model_copy(update={"mapping": small}))
     messages = [(record.topic, record.message()) for record in read_log(out)]
     odometry = [m for topic, m in messages if topic == "/alpha/odometry" and m.status != "lost"]
     found = np.array([m.T_map_camera for m in odometry])
