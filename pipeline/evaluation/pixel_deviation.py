@@ -150,7 +150,7 @@ def rendered_depth(
         depth_kind=stated.depth,
         mask=mask,
     )
-    layer_m, depth_m = rasterizer.layer_depth(), surface_depth(blended.render)
+    layer_m, depth_m = blended.layer_m, surface_depth(blended.render)
     sigma_m = np.zeros_like(depth_m)
     drawn = (depth_m > 0) & (blended.weight >= LEAST_STATED * blended.render.alpha)
     between_m = np.where(layer_m[drawn] > 0, depth_m[drawn] - layer_m[drawn], 0.0)

@@ -98,7 +98,7 @@ def score_view(
             left out.
         depth_m: recorded depth [h, w], 0 where there is none.
         exact_m: exact depth [h, w] in meters, or Absent.
-        layer_m: depth of one layer per pixel (`Rasterizer.layer_depth`), [h, w] in meters, or Absent.
+        layer_m: depth of one layer per pixel (`Rasterizer.forward_with_layer`), [h, w] in meters, or Absent.
         common: [h, w], pixels that the maps that this one is compared with cover, too; None: there are none.
         exposure: of the view, by frames other than it, for `psnr_interpolated_db` and `psnr_moved_db` alone. None: as
             the map.
@@ -263,8 +263,10 @@ def score_maps(
         for name, (gaussians, poses) in maps.items():
             T = poses.get(frame.stamp_ns)
             if T is not None:
-                render = own.rasterizer.forward(gaussians, camera, se3.inverse(T), depth_kind=depth)
-                layer_m, moved = own.rasterizer.layer_depth(), None
+                render, layer_m = own.rasterizer.forward_with_layer(
+                    gaussians, camera, se3.inverse(T), depth_kind=depth
+                )
+                moved = None
                 if view.T_camera_moment is not None:
                     passed = T @ view.T_camera_moment
                     moved = draw_moving(own.rasterizer, gaussians, camera, passed, depth_kind=depth)

@@ -102,11 +102,10 @@ class ModelTracker:
 
     def _drawn(self, T_map_camera: Array) -> Reference:
         """What a camera at T_map_camera sees of the map."""
-        drawn = self._rasterizer.forward(
+        drawn, layer_m = self._rasterizer.forward_with_layer(
             self._gaussians, self._camera, se3.inverse(T_map_camera), depth_kind=self._depth
         )
-        solid = drawn.alpha > self.config.min_alpha
-        depth_m = np.where(solid, self._rasterizer.layer_depth(), np.float32(0))
+        depth_m = np.where(drawn.alpha > self.config.min_alpha, layer_m, np.float32(0))
         color = np.clip(drawn.color, np.float32(0), np.float32(1))
         pyramid = RgbdPyramid.build(color, depth_m, self._camera, self._levels)
         return Reference.from_pyramid(pyramid, self.config.strides[: self._levels])

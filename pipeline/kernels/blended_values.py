@@ -24,11 +24,13 @@ class BlendedValues:
         render: of the map; its colors mean nothing.
         mean: of the numbers, float32; infinite where no Gaussian has one.
         weight: blending weight of the Gaussians that have one, float32.
+        layer_m: depth of the layer that stops the light, meters (`Rasterizer.forward_with_layer`).
     """
 
     render: Render
     mean: NDArray[np.float32]
     weight: NDArray[np.float32]
+    layer_m: NDArray[np.float32]
 
 
 def blended_values(
@@ -54,10 +56,10 @@ def blended_values(
     """
     known = np.isfinite(values)
     colors = np.stack([np.where(known, values, 0.0), known, known], axis=1)
-    render = rasterizer.forward(
+    render, layer_m = rasterizer.forward_with_layer(
         gaussians.replace(colors=colors), camera, T_camera_map, depth_kind=depth_kind, mask=mask
     )
     weight = render.color[..., 1]
     mean = np.full(weight.shape, np.inf, np.float32)
     np.divide(render.color[..., 0], weight, out=mean, where=weight > 0)
-    return BlendedValues(render, mean, weight)
+    return BlendedValues(render, mean, weight, layer_m)

@@ -52,14 +52,16 @@ SAME_LAYER = 0.05  # relative difference of depth
 
 _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)
+_View = tuple[int, int, tuple[Any, ...]]
+"""Height, width, and what the kernels take of a view, checked."""
 
 
 class Rasterizer:
     """Draws Gaussians into a camera, and takes derivatives back to them.
 
-    `backward`, `fisher`, `contributions` and `layer_depth` refer to the last `forward`; the arrays of its Gaussians
-    must not have changed since. Scratch memory stays between calls. One Rasterizer serves one thread at a time; the GIL
-    is released. All results are the same bits for any number of threads and on every instruction set.
+    `backward`, `fisher` and `contributions` refer to the last `forward`, with or without the layer; the arrays of its
+    Gaussians must not have changed since. Scratch memory stays between calls. One Rasterizer serves one thread at a
+    time; the GIL is released. All results are the same bits for any number of threads and on every instruction set.
     """
 
     def __init__(self, isa: str = "auto", threads: SupportsIndex = 1) -> None:
@@ -109,12 +111,55 @@ class Rasterizer:
         Raises:
             ValueError: an argument that no camera or Gaussian can have; the message names it.
         """
-        height, width, view = self._view(
+        view = self._view(
             gaussians, camera, T_camera_map, background=background, mask=mask, depth_kind=depth_kind
         )
+        return self._render(gaussians, view, NOTHING, SAME_LAYER)
+
+    def forward_with_layer(
+        self,
+        gaussians: Gaussians,
+        camera: PinholeCamera,
+        T_camera_map: ArrayLike,
+        *,
+        depth_kind: DepthKind = "blended",
+        mask: NDArray[np.bool_] | None = None,
+        tolerance: float = SAME_LAYER,
+    ) -> tuple[Render, Image]:
+        """Draw the Gaussians before black, and the depth of the surface that stops the light of each pixel.
+
+        The median Gaussian of a pixel is the one at which half of the light is stopped; the depth of its layer is the
+        mean, by blending weight, of the Gaussians within `tolerance` (relative) of its depth. At an edge, where the
+        blended depth mixes two surfaces, it is that of one of them. No derivative is taken of it.
+
+        Args:
+            gaussians: as in `forward`.
+            camera: as in `forward`.
+            T_camera_map: as in `forward`.
+            depth_kind: as in `forward`.
+            mask: as in `forward`.
+            tolerance: relative difference of depth, 0..1.
+        Returns:
+            The same as `forward`; and the depth of the layer [H, W], meters, 0 where more than half of the light
+            passes.
+        Raises:
+            ValueError: as `forward`; or the tolerance is out of range.
+        """
+        if not (isinstance(tolerance, Real) and 0 <= float(tolerance) <= 1):
+            raise ValueError(f"tolerance is {tolerance!r}, expected a number from 0 to 1")
+        view = self._view(
+            gaussians, camera, T_camera_map, background=(0.0, 0.0, 0.0), mask=mask, depth_kind=depth_kind
+        )
+        layer = empty(*view[:2])
+        return self._render(gaussians, view, layer, float(tolerance)), layer
+
+    def _render(self, gaussians: Gaussians, view: _View, layer: Image, tolerance: float) -> Render:
+        """Draw a view of `_view`, and the depth of its layer into an array that has pixels."""
+        height, width, of_view = view
         color, depths, alpha = empty(height, width, 3), empty(height, width), empty(height, width)
         self._gaussians = None  # whatever ends the call, nothing may follow on what is half drawn
-        status = self._raster.forward(*arrays_of(gaussians), *view, color, depths, alpha)
+        images = color, depths, alpha, layer
+        status = self._raster.forward(*arrays_of(gaussians), *of_view, *images, tolerance)
         self._finish(gaussians, (height, width), status)
         return Render(color, depths, alpha)
 
@@ -205,8 +250,7 @@ class Rasterizer:
         background: ArrayLike,
         mask: NDArray[np.bool_] | None,
         depth_kind: DepthKind,
-    ) -> tuple[int, int, tuple[Any, ...]]:
-        """Height, width, and what the kernels take of a view, checked."""
+    ) -> _View:
         check_type("gaussians", gaussians, Gaussians)
         height, width, intrinsics = checked_camera(camera)
         pose = checked_pose("T_camera_map", T_camera_map)
@@ -353,24 +397,6 @@ class Rasterizer:
         pixels = np.zeros(len(gaussians), dtype=np.uint32)
         self._raster.contributions(weights, pixels)
         return weights, pixels
-
-    def layer_depth(self, tolerance: float = SAME_LAYER) -> Image:
-        """Depth [H, W] of the surface that stops the light of each pixel of the last view, meters.
-
-        The median Gaussian is the one at which half of the light is stopped; the result is the mean depth, by
-        blending weight, of the Gaussians within `tolerance` (relative) of its depth. At an edge, where the blended
-        depth mixes two surfaces, it is that of one of them. 0 where more than half of the light passes. No derivative
-        is taken of it.
-
-        Args:
-            tolerance: relative difference of depth, 0..1.
-        """
-        _, size = self._last_forward()
-        if not (isinstance(tolerance, Real) and 0 <= float(tolerance) <= 1):
-            raise ValueError(f"tolerance is {tolerance!r}, expected a number from 0 to 1")
-        depth = empty(*size)
-        self._raster.layer_depth(float(tolerance), depth)
-        return depth
 
     @property
     def visible(self) -> int:

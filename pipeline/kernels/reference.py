@@ -76,6 +76,32 @@ class ReferenceRasterizer:
         self._painting = paint(self._pixels, self._screen, self._background)
         return Render(*(self._image(values) for values in self._painting[:3]))
 
+    def forward_with_layer(
+        self,
+        gaussians: Gaussians,
+        camera: PinholeCamera,
+        T_camera_map: ArrayLike,
+        *,
+        depth_kind: DepthKind = "blended",
+        mask: NDArray[np.bool_] | None = None,
+        tolerance: float = 0.05,
+    ) -> tuple[Render, NDArray[np.float64]]:
+        """Draw them and the depth of one layer; see `Rasterizer.forward_with_layer`."""
+        render = self.forward(gaussians, camera, T_camera_map, depth_kind=depth_kind, mask=mask)
+        return render, self._layer(tolerance)
+
+    def _layer(self, tolerance: float) -> NDArray[np.float64]:
+        """Depth [H, W] of the layer that the median Gaussian of a pixel lies on."""
+        weights, depths = (part.detach().numpy() for part in (self._painting.weights, self._painting.depths))
+        left = 1 - np.cumsum(weights, axis=1)
+        before = np.concatenate([np.ones((len(left), 1)), left[:, :-1]], axis=1)
+        median = np.where((before >= 0.5) & (left < 0.5), depths, 0.0).sum(axis=1)
+        own = np.where(np.abs(depths - median[:, None]) <= tolerance * median[:, None], weights, 0.0)
+        mean = (own * depths).sum(axis=1) / np.maximum(own.sum(axis=1), 1e-8)
+        image = np.zeros(self._drawn.shape)
+        image[self._drawn] = np.where(median > 0, mean, 0.0)
+        return image
+
     def backward(
         self,
         d_color: ArrayLike,
@@ -170,18 +196,6 @@ class ReferenceRasterizer:
         """Sum of the blending weights [n] of each Gaussian and number of its pixels [n]."""
         weights = self._weights()
         return weights.sum(axis=0), (weights > 0).sum(axis=0).astype(np.uint32)
-
-    def layer_depth(self, tolerance: float = 0.05) -> NDArray[np.float64]:
-        """Depth [H, W] of the layer that the median Gaussian of a pixel lies on; see `Rasterizer.layer_depth`."""
-        weights, depths = (part.detach().numpy() for part in (self._painting.weights, self._painting.depths))
-        left = 1 - np.cumsum(weights, axis=1)
-        before = np.concatenate([np.ones((len(left), 1)), left[:, :-1]], axis=1)
-        median = np.where((before >= 0.5) & (left < 0.5), depths, 0.0).sum(axis=1)
-        own = np.where(np.abs(depths - median[:, None]) <= tolerance * median[:, None], weights, 0.0)
-        mean = (own * depths).sum(axis=1) / np.maximum(own.sum(axis=1), 1e-8)
-        image = np.zeros(self._drawn.shape)
-        image[self._drawn] = np.where(median > 0, mean, 0.0)
-        return image
 
     def gate_margin(self) -> float:
         """Smallest relative distance of any pair of pixel and Gaussian from the thresholds of alpha and transmittance.

@@ -65,7 +65,8 @@ def test_a_pixel_that_blends_two_surfaces_deviates_by_what_that_shifts_it():
     both = Gaussians.concatenate([near, far]).replace(ids=np.arange(n))
     rasterizer = Rasterizer()
     found = rendered_depth(rasterizer, StatedMap(both, np.full(n, 1e-3), "ray_plane"), CAMERA, np.eye(4))
-    shift_m = abs(found.depth_m[MIDDLE] - rasterizer.layer_depth()[MIDDLE])
+    layer_m = rasterizer.forward_with_layer(both, CAMERA, np.eye(4), depth_kind="ray_plane")[1]
+    shift_m = abs(found.depth_m[MIDDLE] - layer_m[MIDDLE])
     assert shift_m > 0.2
     assert found.sigma_m[MIDDLE] == pytest.approx(shift_m, rel=1e-3)
 

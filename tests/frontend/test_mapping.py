@@ -308,8 +308,8 @@ def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
         )
         mapper.finalize()
         rasterizer, depth_m = Rasterizer(), shot(POSES[1])[1]
-        rasterizer.forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth_kind="ray_plane")
-        layer_m = rasterizer.layer_depth()
+        view = mapper.gaussians, CAMERA, se3.inverse(POSES[1])
+        layer_m = rasterizer.forward_with_layer(*view, depth_kind="ray_plane")[1]
         assert (layer_m > 0).mean() > 0.97
         return float(np.abs(layer_m - depth_m)[layer_m > 0].mean())
 

@@ -138,8 +138,8 @@ def test_what_a_view_draws_is_in_the_cells_that_it_sees() -> None:
     )
     rasterizer, cells = Rasterizer(), MapCells.of(walls)
     for T in POSES[::3]:
-        rasterizer.forward(walls, CAMERA, se3.inverse(T))
-        weights, depth_m = rasterizer.contributions()[0], rasterizer.layer_depth()
+        _, depth_m = rasterizer.forward_with_layer(walls, CAMERA, se3.inverse(T))
+        weights = rasterizer.contributions()[0]
         assert weights[len(nearer) :].sum() > 10
         seen = cells.seen(depth_m, T, CAMERA)
         missing = np.setdiff1d(np.arange(len(walls)), seen)

@@ -37,8 +37,8 @@ def evaluate(rasterizer, kind):
 
 
 def layers_of(rasterizer, scene, depth):
-    rasterizer.forward(scene.gaussians, scene.camera, scene.T_camera_map, scene.background, depth_kind=depth)
-    return rasterizer.layer_depth()
+    view = scene.gaussians, scene.camera, scene.T_camera_map
+    return rasterizer.forward_with_layer(*view, depth_kind=depth)[1]
 
 
 @cache

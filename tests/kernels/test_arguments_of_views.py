@@ -228,7 +228,7 @@ def test_a_refused_view_leaves_nothing_to_differentiate():
         rasterizer.contributions()
 
 
-@pytest.mark.parametrize("call", ["full_fisher", "fisher", "contributions", "statistics", "layer_depth"])
+@pytest.mark.parametrize("call", ["full_fisher", "fisher", "contributions", "statistics"])
 def test_nothing_to_ask_before_the_first_view(call):
     arguments = {"full_fisher": (ones(), ones()), "fisher": (ones(), ones(), FisherSums(0))}.get(call, ())
     with pytest.raises(RuntimeError, match="forward"):
@@ -248,7 +248,7 @@ def test_arguments_of_the_opacity_information_that_cannot_be(name):
 @pytest.mark.parametrize("tolerance", [-0.1, 1.5, float("nan"), "0.05", None])
 def test_tolerances_that_cannot_be(tolerance):
     with pytest.raises(ValueError, match="tolerance is"):
-        drawn().layer_depth(tolerance)
+        Rasterizer().forward_with_layer(random_gaussians(5, 0), CAMERA, np.eye(4), tolerance=tolerance)
 
 
 @pytest.mark.parametrize("name", ["inv_var_color", "inv_var_depth"])

@@ -141,7 +141,8 @@ def test_nothing_is_drawn_behind_a_closed_mask(rasterizer, plain):
     assert not flat(gradients).any()
     assert not gradients.pose.any()
     assert not any(array.any() for array in rasterizer.contributions())
-    assert not rasterizer.layer_depth().any()
+    layer = rasterizer.forward_with_layer(plain.gaussians, plain.camera, plain.T_camera_map, mask=mask)[1]
+    assert not layer.any()
 
 
 def test_pose_alone_is_the_same_pose(rasterizer, scene):
@@ -181,8 +182,9 @@ def test_one_layer_is_never_between_two(rasterizer, depth):
     """A near wall covers the right half: blended depth slides from the far one to it, the layer's depth jumps."""
     camera = tiny().camera
     near, far = wall(1.0, 0.9, right_of_px=3), wall(2.0, 0.9)
-    render = rasterizer.forward(Gaussians.concatenate([near, far]), camera, np.eye(4), depth_kind=depth)
-    layer, blended = rasterizer.layer_depth(), render.depth / render.alpha
+    both = Gaussians.concatenate([near, far])
+    render, layer = rasterizer.forward_with_layer(both, camera, np.eye(4), depth_kind=depth)
+    blended = render.depth / render.alpha
     is_near, is_far = np.abs(layer - 1) < 1e-3, np.abs(layer - 2) < 2e-3
     assert (is_near | is_far).all()
     assert is_near[:, 5:].all()
@@ -192,17 +194,17 @@ def test_one_layer_is_never_between_two(rasterizer, depth):
 
 def test_one_layer_of_one_wall_is_its_depth(rasterizer):
     camera = tiny().camera
-    render = rasterizer.forward(wall(1.5, 0.9), camera, np.eye(4))
-    np.testing.assert_allclose(rasterizer.layer_depth(), render.depth / render.alpha, rtol=1e-5)
-    rasterizer.forward(wall(1.5, 0.05), camera, np.eye(4))
-    light = rasterizer.forward(wall(1.5, 0.05), camera, np.eye(4)).alpha < 0.499
+    render, layer = rasterizer.forward_with_layer(wall(1.5, 0.9), camera, np.eye(4))
+    np.testing.assert_allclose(layer, render.depth / render.alpha, rtol=1e-5)
+    render, layer = rasterizer.forward_with_layer(wall(1.5, 0.05), camera, np.eye(4))
+    light = render.alpha < 0.499
     assert light.any()
-    assert not rasterizer.layer_depth()[light].any()
+    assert not layer[light].any()
 
 
 def test_a_layer_without_tolerance_is_the_median_gaussian(rasterizer):
     camera, stack = tiny().camera, [wall(z, 0.3) for z in (1.0, 1.02, 1.04, 1.06, 1.08)]
-    rasterizer.forward(Gaussians.concatenate(stack), camera, np.eye(4))
-    exact, loose = rasterizer.layer_depth(0.0), rasterizer.layer_depth(0.2)
+    view = Gaussians.concatenate(stack), camera, np.eye(4)
+    exact, loose = (rasterizer.forward_with_layer(*view, tolerance=x)[1] for x in (0.0, 0.2))
     assert np.isin(np.round(exact.astype(np.float64), 4), [1.0, 1.02, 1.04, 1.06, 1.08]).all()
     assert np.ptp(loose) < np.ptp([1.0, 1.08])

@@ -43,7 +43,9 @@ def digest(rasterizer: Rasterizer, count: int = FEW) -> str:
         arrays += [opacity, seen]
         arrays += [*vars(render).values(), *vars(gradients).values(), *sums.arrays().values(), by_pose.pose]
         arrays += [rasterizer.full_fisher(of_color, of_depth), *rasterizer.contributions()]
-        arrays += [rasterizer.layer_depth()]
+        again, layer_m = rasterizer.forward_with_layer(*view, depth_kind=depth, mask=mask)
+        assert np.array_equal(again.alpha, render.alpha)
+        arrays += [layer_m]
         loss, gradients = rasterizer.view_gradients(
             *view,
             color=color,

@@ -57,7 +57,7 @@ struct OpenBlock {
 
 // alpha and weight of a block's items, for a sweep that follows at once.
 struct Memory {
-    static constexpr bool CLOSES = false;
+    static constexpr bool CLOSES = false, LAYERED = false;
     float *alphas, *weights;
     float least() const { return TRANSMITTANCE_MIN; }
     void keep(uint32_t item, Vec alpha, Vec weight) const {
@@ -66,7 +66,7 @@ struct Memory {
     }
 };
 struct NoMemory {
-    static constexpr bool CLOSES = false;
+    static constexpr bool CLOSES = false, LAYERED = false;
     float least() const { return TRANSMITTANCE_MIN; }
     void keep(uint32_t, Vec, Vec) const {}
 };
@@ -76,6 +76,18 @@ struct ClosingMemory : Memory {
     float closing;
     ClosingMemory(const Memory& memory, float least) : Memory(memory), closing(least) {}
     float least() const { return closing; }
+};
+// Weight and depth of a block's items, and the depth of the one behind which less than half of the light is left, 0 where there is none.
+struct LayerMemory {
+    static constexpr bool CLOSES = false, LAYERED = true;
+    float *weights, *depths;
+    Vec* median;
+    float least() const { return TRANSMITTANCE_MIN; }
+    void keep(uint32_t item, Vec, Vec weight) const { store(weights + static_cast<size_t>(item) * LANES, weight); }
+    void keep_depth(uint32_t item, Vec z, Mask passes_half) const {
+        store(depths + static_cast<size_t>(item) * LANES, z);
+        *median = select(passes_half, z, *median);
+    }
 };
 
 // Blends the next N candidates; keeps those that were blended.
@@ -119,6 +131,9 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
         block.B = fma(weight, Vec(s.b), block.B);
         block.D = fma(weight, KIND == DepthKind::ray_plane ? depth[k] : Vec(s.z), block.D);  // z is not kept in a register
         memory.keep(kept, select_or_zero(blended, alpha[k]), weight);
+        if constexpr (Kept::LAYERED)
+            memory.keep_depth(kept, KIND == DepthKind::ray_plane ? depth[k] : Vec(s.z),
+                              blended & (before >= Vec(0.5f)) & (block.left < Vec(0.5f)));
         const uint32_t pixels = bits(blended);
         items.positions[kept] = position[k];
         items.pixels[kept] = static_cast<uint16_t>(pixels);
@@ -156,30 +171,6 @@ inline OpenBlock blend_block(const Frame& frame, const Tile& tile, const Splat* 
     store(items.T + b * LANES, image.T);
     items.skip(items.counts[b]);
     return image;
-}
-
-template <DepthKind KIND>
-inline void blend_tile(Frame& frame, int index, float* color, float* depth, float* alpha) {
-    const Tile tile(frame, index);
-    const View& view = frame.view;
-    const Splat* splats = gather_splats(frame, tile);
-    const Vec background[3] = {Vec(view.background[0]), Vec(view.background[1]), Vec(view.background[2])};
-    TileItems items(frame, index);
-    uint64_t evaluated = 0;
-    for (int b = 0; b < BLOCKS; b++) {
-        const Block block(tile, b, view);
-        items.counts[b] = 0;
-        if (block.outside(view)) continue;
-        const Mask wanted = mask_of_bits(block.wanted(view));
-        const OpenBlock image = blend_block<KIND>(frame, tile, splats, b, block, wanted, NoMemory(), items, evaluated);
-        const Vec rgb[3] = {select_or_zero(wanted, fma(image.T, background[0], image.R)),
-                            select_or_zero(wanted, fma(image.T, background[1], image.G)),
-                            select_or_zero(wanted, fma(image.T, background[2], image.B))};
-        write_block_rgb(color, block, view, rgb);
-        write_block(depth, block, view, image.D);
-        write_block(alpha, block, view, Vec(1.0f) - image.T);
-    }
-    frame.evaluated.data()[index] = evaluated;
 }
 
 }  // namespace KERNEL_ISA

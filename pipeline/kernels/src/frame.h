@@ -246,6 +246,12 @@ struct AdamLimits {
 
 enum class Status { ok, bad_gaussians, bad_first_image, bad_second_image, bad_third_image, too_many_intersections };
 
+// What a view is drawn into. layer: null: not wanted; tolerance: of its depth, relative.
+struct Images {
+    float *color, *depth, *alpha, *layer;
+    float tolerance;
+};
+
 struct RegistrationKernels;  // registration_data.h
 
 // One build of the kernels for one instruction set.
@@ -253,7 +259,7 @@ struct Kernels {
     const char* name;
     const RegistrationKernels* registration;
     // Images other than color may be null in the backward pass: zero.
-    Status (*forward)(Frame&, const GaussianArrays&, float* color, float* depth, float* alpha);
+    Status (*forward)(Frame&, const GaussianArrays&, const Images&);
     Status (*backward)(Frame&, const GaussianArrays&, const float* d_color, const float* d_depth,
                        const float* d_alpha, const GradientArrays&);
     // residual may be null.
@@ -263,7 +269,6 @@ struct Kernels {
     Status (*opacity_information)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth,
                                   double* information, uint32_t* observations);
     void (*contributions)(Frame&, float* weights, uint32_t* pixels);
-    void (*layer_depth)(Frame&, float tolerance, float* depth);
     // information: [n, 14, 14]
     Status (*full_fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, double* information);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);

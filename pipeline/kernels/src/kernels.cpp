@@ -1,8 +1,8 @@
 // All kernels of one instruction set. Compiled once per set, with KERNEL_ISA the namespace of the build.
 #include "adam.h"
+#include "drawing.h"
 #include "fitting.h"
 #include "full_information.h"
-#include "layer.h"
 #include "machine_peak.h"
 #include "opacity.h"
 
@@ -15,14 +15,16 @@ static Status by_depth_kind(const Frame& frame, Call call) {
     return call(std::integral_constant<DepthKind, DepthKind::blended>{});
 }
 
-static Status forward(Frame& frame, const GaussianArrays& gaussians, float* color, float* depth, float* alpha) {
+static Status forward(Frame& frame, const GaussianArrays& gaussians, const Images& images) {
     const Status status = make_lists(frame, gaussians);
     if (status != Status::ok) return status;
+    if (images.layer) frame.front.need((frame.longest_list + 1) * LANES * 2 * frame.threads);
     return by_depth_kind(frame, [&](auto kind) {
         constexpr DepthKind KIND = kind;
         const int tiles = frame.tiles_x * frame.tiles_y;
+        const auto draw = images.layer ? draw_tile<KIND, true> : draw_tile<KIND, false>;
 #pragma omp parallel for schedule(dynamic, 4) num_threads(frame.threads) if (frame.threads > 1)
-        for (int tile = 0; tile < tiles; tile++) blend_tile<KIND>(frame, tile, color, depth, alpha);
+        for (int tile = 0; tile < tiles; tile++) draw(frame, tile, images);
         return Status::ok;
     });
 }
@@ -125,17 +127,6 @@ static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
     }
 }
 
-static void layer_depth(Frame& frame, float tolerance, float* depth) {
-    frame.front.need((frame.longest_list + ABREAST) * LANES * 2 * frame.threads);
-    by_depth_kind(frame, [&](auto kind) {
-        constexpr DepthKind KIND = kind;
-        return over_tiles(frame, [&](int tile) {
-            layer_tile<KIND>(frame, tile, tolerance, depth);
-            return Status::ok;
-        });
-    });
-}
-
 template <Derivatives D>
 static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {
     Status status = make_lists(frame, gaussians);
@@ -174,6 +165,6 @@ namespace raster {
 extern const RegistrationKernels REGISTRATION_TABLE;
 extern const Kernels KERNEL_TABLE;
 const Kernels KERNEL_TABLE = {AS_TEXT(KERNEL_ISA), &REGISTRATION_TABLE, KERNEL_ISA::forward, KERNEL_ISA::backward, KERNEL_ISA::fisher,
-                              KERNEL_ISA::opacity_information, KERNEL_ISA::contributions, KERNEL_ISA::layer_depth, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam,
+                              KERNEL_ISA::opacity_information, KERNEL_ISA::contributions, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam,
                               KERNEL_ISA::fma_rate, KERNEL_ISA::bandwidth};
 }  // namespace raster

@@ -120,12 +120,13 @@ public:
 
     int forward(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
                 const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, bool ray_plane, int width,
-                int height, int threads, const Floats& color, const Floats& depth, const Floats& alpha) {
+                int height, int threads, const Floats& color, const Floats& depth, const Floats& alpha, const Floats& layer, float tolerance) {
         const Use use(busy_);
         look(pose, intrinsics, background, mask, ray_plane, width, height, threads);
         const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
         const nb::gil_scoped_release unlocked;
-        return static_cast<int>(kernels_->forward(frame_, gaussians, color.data(), depth.data(), alpha.data()));
+        const Images images = {color.data(), depth.data(), alpha.data(), data_or_null(layer), tolerance};
+        return static_cast<int>(kernels_->forward(frame_, gaussians, images));
     }
 
     // Forward, loss and backward; weights: of the loss, then gain, offset, and the weight of surface. values: as LossValues.
@@ -201,12 +202,6 @@ public:
         kernels_->contributions(frame_, weights.data(), pixels.data());
     }
 
-    void layer_depth(float tolerance, const Floats& depth) {
-        const Use use(busy_);
-        const nb::gil_scoped_release unlocked;
-        kernels_->layer_depth(frame_, tolerance, depth.data());
-    }
-
     // Pairs of a pixel and a Gaussian in the last view: whose alpha was computed, that were blended.
     std::pair<uint64_t, uint64_t> pairs() const {
         uint64_t evaluated = 0, blended = 0;
@@ -274,8 +269,7 @@ NB_MODULE(_raster, m) {
         .def("fisher", &Raster::fisher)
         .def("opacity_information", &Raster::opacity_information)
         .def("full_fisher", &Raster::full_fisher)
-        .def("contributions", &Raster::contributions)
-        .def("layer_depth", &Raster::layer_depth);
+        .def("contributions", &Raster::contributions);
     m.def("adam", &raster::adam);
     m.def("empty", &raster::OutputPool::array);
     m.def("fma_rate", &raster::fma_rate);
