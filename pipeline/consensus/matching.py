@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,14 +43,30 @@ _FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
 
 def held_thickness(vec_log_covariance: Array, floor_m: float) -> Array:
     """Unit vectors v = vec(e e') [n, 3, 6] of the axes at the thickness floor; zero for the others."""
-    return in_blocks(partial(_held_thickness, floor_m=floor_m), vec_log_covariance)
+    return in_blocks(lambda rows: _Axes.of(rows).held(floor_m), vec_log_covariance)
 
 
-def _held_thickness(vec_log_covariance: Array, floor_m: float) -> Array:
-    values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
-    held = 0.5 * values <= np.log(floor_m) + _FLOOR_SLACK
-    axes = vectors.swapaxes(-1, -2)  # [n, axis, 3]
-    return spd.sym_to_vec(axes[..., :, None] * axes[..., None, :]) * held[..., None]
+@dataclass(frozen=True)
+class _Axes:
+    """Eigenvalues [n, 3] and eigenvectors [n, 3, 3], in columns, of log-covariances."""
+
+    values: Array
+    vectors: Array
+
+    @staticmethod
+    def of(vec_log_covariance: Array) -> _Axes:
+        return _Axes(*np.linalg.eigh(spd.vec_to_sym(vec_log_covariance)))
+
+    def held(self, floor_m: float) -> Array:
+        """As `held_thickness`."""
+        held = 0.5 * self.values <= np.log(floor_m) + _FLOOR_SLACK
+        axes = self.vectors.swapaxes(-1, -2)  # [n, axis, 3]
+        return spd.sym_to_vec(axes[..., :, None] * axes[..., None, :]) * held[..., None]
+
+    def no_thinner(self, floor_m: float) -> Array:
+        """The log-covariances [n, 6] with no standard deviation below the floor."""
+        values = np.maximum(self.values, 2 * np.log(floor_m))
+        return spd.sym_to_vec((self.vectors * values[:, None, :]) @ self.vectors.swapaxes(-1, -2))
 
 
 def _without(delta: Array, v: Array) -> Array:
@@ -73,34 +88,48 @@ class _Chart:
 
     @staticmethod
     def of(theta: Array, config: MapMatching) -> _Chart:
-        clamped = theta.copy()
-        no_thinner = partial(_no_thinner, floor_m=config.thickness_floor_m)
-        clamped[:, LOG_COVARIANCE] = in_blocks(no_thinner, theta[:, LOG_COVARIANCE])
-        held = held_thickness(theta[:, LOG_COVARIANCE], config.thickness_floor_m)
+        clamped, held = theta.copy(), np.empty((len(theta), 3, 6))
+        for rows in row_blocks(len(theta)):
+            axes = _Axes.of(theta[rows, LOG_COVARIANCE])
+            clamped[rows, LOG_COVARIANCE] = axes.no_thinner(config.thickness_floor_m)
+            held[rows] = axes.held(config.thickness_floor_m)
         return _Chart(clamped, held, ~np.any(held != 0, axis=(1, 2)))
 
 
-def _no_thinner(vec_log_covariance: Array, floor_m: float) -> Array:
-    """The same [n, 6] with no standard deviation below the floor."""
-    values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
-    values = np.maximum(values, 2 * np.log(floor_m))
-    return spd.sym_to_vec((vectors * values[:, None, :]) @ vectors.swapaxes(-1, -2))
+def _shape_difference(charts: tuple[_Chart, _Chart], i: Rows, j: Rows) -> Array:
+    """Differences [m, 6] of log Sigma without what one of a pair holds and the other does not."""
+    a, b = charts
+    delta: Array = a.theta[i, LOG_COVARIANCE] - b.theta[j, LOG_COVARIANCE]
+    lacking = (a.held, i, b.thick[j] & ~a.thick[i]), (b.held, j, a.thick[i] & ~b.thick[j])
+    for held, at, unequal in lacking:
+        delta[unequal] = _without(delta[unequal], held[at[unequal]])
+    return delta
 
 
-def _distances(charts: tuple[_Chart, _Chart], i: Rows, j: Rows, config: MapMatching) -> Array:
-    """d_G [m] of Gaussians i of the first chart and j of the second."""
+def _squared_apart(charts: tuple[_Chart, _Chart], i: Rows, j: Rows, config: MapMatching) -> Array:
+    """What places and shapes are of d_G^2 [m], of Gaussians i of the first chart and j of the second."""
     a, b = charts
     out = np.empty(len(i))
     for part in row_blocks(len(i)):
-        delta = a.theta[i[part]] - b.theta[j[part]]
-        shape = _without(delta[:, LOG_COVARIANCE], a.held[i[part]] * b.thick[j[part], None, None])
-        shape = _without(shape, b.held[j[part]] * a.thick[i[part], None, None])
-        out[part] = np.sqrt(
-            np.sum(delta[:, MEAN] ** 2, axis=1) / config.position_scale_m**2
-            + config.beta_log_covariance * np.sum(shape**2, axis=1)
-            + config.beta_color * np.sum((delta[:, COLOR] / SH_C0) ** 2, axis=1)
-            + config.beta_opacity * delta[:, OPACITY] ** 2
-        )
+        rows = i[part], j[part]
+        delta = a.theta[rows[0], MEAN] - b.theta[rows[1], MEAN]
+        out[part] = np.sum(delta**2, axis=1) / config.position_scale_m**2
+        out[part] += config.beta_log_covariance * np.sum(_shape_difference(charts, *rows) ** 2, axis=1)
+    return out
+
+
+def _distances(
+    charts: tuple[_Chart, _Chart], i: Rows, j: Rows, config: MapMatching, *, squared_apart: Array
+) -> Array:
+    """d_G [m] of Gaussians i of the first chart and j of the second, with what `_squared_apart` gave of them."""
+    a, b = charts
+    out = np.empty(len(i))
+    for part in row_blocks(len(i)):
+        rows = i[part], j[part]
+        color = (a.theta[rows[0], COLOR] - b.theta[rows[1], COLOR]) / SH_C0
+        opacity = a.theta[rows[0], OPACITY] - b.theta[rows[1], OPACITY]
+        squared = squared_apart[part] + config.beta_color * np.sum(color**2, axis=1)
+        out[part] = np.sqrt(squared + config.beta_opacity * opacity**2)
     return out
 
 
@@ -117,15 +146,19 @@ def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: M
     used_a, i = np.unique(i, return_inverse=True)
     used_b, j = np.unique(j, return_inverse=True)
     charts = _Chart.of(a.theta[used_a], config), _Chart.of(b.theta[used_b], config)
-    return _distances(charts, i, j, config)
+    return _distances(charts, i, j, config, squared_apart=_squared_apart(charts, i, j, config))
 
 
 def threshold(own: Evidence, config: MapMatching) -> float:
     """tau_G of a map: how much its own neighboring Gaussians differ; 0 if no two are within the radius."""
     if len(own) < 2:
         return 0.0
-    near, other = _neighbors(own.theta[:, MEAN], config.radius_m)
-    return _threshold(_Chart.of(own.theta, config), near, other, config)
+    chart = _Chart.of(own.theta, config)
+    charts, neighbors = (chart, chart), _neighbors(own.theta[:, MEAN], config.radius_m)
+    return _threshold(
+        _distances(charts, *neighbors, config, squared_apart=_squared_apart(charts, *neighbors, config)),
+        config,
+    )
 
 
 def _neighbors(means: Array, radius_m: float) -> tuple[Index, Index]:
@@ -136,10 +169,9 @@ def _neighbors(means: Array, radius_m: float) -> tuple[Index, Index]:
     return near, np.where(neighbor[near, 1] == near, neighbor[near, 0], neighbor[near, 1])
 
 
-def _threshold(chart: _Chart, near: Index, other: Index, config: MapMatching) -> float:
-    if not len(near):
-        return 0.0
-    return float(np.percentile(_distances((chart, chart), near, other, config), config.percentile))
+def _threshold(between_neighbors: Array, config: MapMatching) -> float:
+    """tau_G by d_G between the neighbors of a map."""
+    return float(np.percentile(between_neighbors, config.percentile)) if len(between_neighbors) else 0.0
 
 
 def match(own: Placed, peer: Placed, config: MapMatching) -> Index:
@@ -164,32 +196,40 @@ def match(own: Placed, peer: Placed, config: MapMatching) -> Index:
 
 @dataclass(frozen=True)
 class _Both:
-    """Two maps that are matched, none empty: candidates and charts, which do not depend on colors but hold them.
+    """Two maps that are matched, none empty: what does not depend on colors is computed once.
 
     Attributes:
         own: Gaussians of the computing robot.
         peer: of the other one, in its own camera's colors.
         charts: of both.
         candidates: rows of both.
+        apart: `_squared_apart` of the candidates.
         neighbors: rows of the own map and of their nearest other ones; empty where there is but one Gaussian.
+        neighbors_apart: `_squared_apart` of the neighbors.
     """
 
     own: Placed
     peer: Placed
     charts: tuple[_Chart, _Chart]
     candidates: tuple[Rows, Rows]
+    apart: Array
     neighbors: tuple[Index, Index]
+    neighbors_apart: Array
 
     @staticmethod
     def of(own: Placed, peer: Placed, config: MapMatching) -> _Both:
         nobody = np.zeros(0, np.int64)
         candidates = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
+        neighbors = (nobody, nobody) if len(own) < 2 else _neighbors(own.theta[:, MEAN], config.radius_m)
+        charts = _Chart.of(own.theta, config), _Chart.of(peer.theta, config)
         return _Both(
             own,
             peer,
-            (_Chart.of(own.theta, config), _Chart.of(peer.theta, config)),
+            charts,
             candidates,
-            (nobody, nobody) if len(own) < 2 else _neighbors(own.theta[:, MEAN], config.radius_m),
+            _squared_apart(charts, *candidates, config),
+            neighbors,
+            _squared_apart((charts[0], charts[0]), *neighbors, config),
         )
 
     def in_colors(self, colors: ColorMap) -> _Both:
@@ -204,8 +244,11 @@ class _Both:
         """Ids of (own, peer), as `match`."""
         own, peer = self.own, self.peer
         i, j = self.candidates
-        d = _distances(self.charts, i, j, config)
-        limit = _threshold(self.charts[0], *self.neighbors, config)
+        own_charts = self.charts[0], self.charts[0]
+        d = _distances(self.charts, i, j, config, squared_apart=self.apart)
+        limit = _threshold(
+            _distances(own_charts, *self.neighbors, config, squared_apart=self.neighbors_apart), config
+        )
         best_of_own = _best_of_each(i, d, limit, lambda at: peer.ids[j[at]])
         best_of_peer = _best_of_each(j, d, limit, lambda at: own.ids[i[at]])
         mutual = np.intersect1d(best_of_own, best_of_peer)
