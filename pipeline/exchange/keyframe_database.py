@@ -9,6 +9,7 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.recall import Recalling, computed
 from duagc.pipeline.config.exchange import ExchangeConfig
@@ -22,9 +23,12 @@ from duagc.pipeline.posegraph.surface_agreement import coarse_depth, surface_agr
 from duagc.pipeline.registration import Reference, RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract, gray_of
 from duagc.pipeline.registration.rectified_features import extract_rectified
+from duagc.pipeline.runs.keyframe_images import Images
 from duagc.pipeline.runs.robot_data import RobotData
 
 PYRAMIDS_KEPT = 12
+KEYFRAMES_TOGETHER = 16
+"""Keyframes whose features are computed, and kept for an exchange that begins again, together."""
 
 
 class KeyframeDatabase:
@@ -49,17 +53,22 @@ class KeyframeDatabase:
         """All features of every keyframe."""
         if self._features is None:
             self._features = []
-            for k in range(self.data.keyframes):
-                features, depth_m = self.recall(f"features {self.data.robot} {k}", partial(self._seen, k))
-                self._features.append(features)
-                self._coarse_depths.append(depth_m)
+            for first in range(0, self.data.keyframes, KEYFRAMES_TOGETHER):
+                keyframes = range(first, min(first + KEYFRAMES_TOGETHER, self.data.keyframes))
+                name = f"features {self.data.robot} {first}"
+                for features, depth_m in self.recall(name, partial(self._all_seen, keyframes)):
+                    self._features.append(features)
+                    self._coarse_depths.append(depth_m)
         return self._features
 
-    def _seen(self, keyframe: int) -> tuple[Features, NDArray[np.float32]]:
-        """Features of a keyframe, and its depth at low resolution."""
-        color, depth_m, _, mask = self.data.images(keyframe)
+    def _all_seen(self, keyframes: range) -> list[tuple[Features, NDArray[np.float32]]]:
+        """Features of keyframes, and their depth at low resolution; by threads."""
+        return list(in_order(self._seen, map(self.data.images, keyframes)))
+
+    def _seen(self, images: Images) -> tuple[Features, NDArray[np.float32]]:
         most = self.config.places.features_per_keyframe
-        return extract(color, depth_m, self.data.camera, most, mask=mask), coarse_depth(depth_m)
+        features = extract(images.color, images.depth_m, self.data.camera, most, mask=images.mask)
+        return features, coarse_depth(images.depth_m)
 
     def rectified(self, keyframe: int) -> Features:
         """Features of the surfaces that a keyframe sees from the side, as if the camera faced them."""

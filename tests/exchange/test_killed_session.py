@@ -30,7 +30,7 @@ class KilledError(Exception):
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the slow functions, as they are called; however fast they are, their results are kept."""
+    """Names of the slow functions, as they are called; however fast they are, each result is kept by itself."""
     made: list[str] = []
 
     def counted(name: str, function: Any) -> Any:
@@ -44,6 +44,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         for name in names:
             monkeypatch.setattr(owner, name, counted(name, getattr(owner, name)))
     monkeypatch.setattr(recall, "WORTH_S", 0.0)
+    monkeypatch.setattr(keyframe_database, "KEYFRAMES_TOGETHER", 1)
     return made
 
 
