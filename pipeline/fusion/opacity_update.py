@@ -6,7 +6,8 @@ pixels have not been used on it yet; so its logit a goes where
 
     sum over own pixels |color rendered - color seen|^2 / (2 sigma^2)  +  1/2 W (a - a_owner)^2
 
-is least, by some Gauss-Newton steps on all of them, the own map held fixed. What no own pixel sees stays as it is.
+is least, by some Gauss-Newton steps, the own map held fixed. Every step looks at every second block of pixels, which
+counts twice, the next one at the others. What no own pixel sees stays as it is.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from duagc.pipeline.fusion.fuse import FusedMap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.kernels.sparse_steps import checkerboards
 from duagc.pipeline.kernels.training import LARGEST_LOGIT
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import OPACITY, OPACITY_INFORMATION
@@ -57,10 +59,10 @@ def update_opacities(
     owners = fused.theta[imported, OPACITY]
     weight = fused.information[imported, OPACITY_INFORMATION]
     logits, gaussians = owners.copy(), fused.gaussians
-    precision = np.float32(1 / (color_sigma**2 * pixels_per_sample))
+    precision = np.float32(2 / (color_sigma**2 * pixels_per_sample))
     pixels = _OwnPixels(views, context, precision, np.float32(LARGEST_RESIDUAL_SIGMA * color_sigma))
-    for _ in range(context.config.own_pixel_steps):
-        slope, seen = (sums[imported] for sums in pixels.sums(gaussians))
+    for k in range(context.config.own_pixel_steps):
+        slope, seen = (sums[imported] for sums in pixels.sums(gaussians, half=k % 2))
         step = -(slope + weight * (logits - owners)) / np.where(seen > 0, seen + weight, 1.0)
         moved = logits + np.clip(step, -LARGEST_STEP, LARGEST_STEP)
         logits = np.where(seen > 0, np.clip(moved, -LARGEST_LOGIT, LARGEST_LOGIT), logits)
@@ -83,43 +85,49 @@ class _OwnPixels:
         Args:
             views: the images.
             context: camera and settings.
-            precision: of a color channel of a pixel.
+            precision: of a color channel of a pixel that is looked at.
             limit: largest residual of a color.
         """
         self._views, self._context, self._limit = views, context, limit
         camera = context.camera
         self._everywhere = np.full((camera.height, camera.width), precision, np.float32)
         self._nowhere, self._precision = np.zeros_like(self._everywhere), precision
+        self._halves = checkerboards(camera.height, camera.width)
         self._rasterizer = Rasterizer(threads=context.threads)
         self._cells: MapCells | None = None
 
-    def sums(self, gaussians: Gaussians) -> tuple[Array, Array]:
-        """Slope and information of the opacity logits [n] of a map, whose other parameters never change."""
+    def sums(self, gaussians: Gaussians, half: int) -> tuple[Array, Array]:
+        """Slope and information of the opacity logits [n] of a map by one half of the pixels, 0 or 1.
+
+        Other parameters of the map never change.
+        """
         slope, information = np.zeros(len(gaussians)), np.zeros(len(gaussians))
         if len(self._views) <= self._context.config.finetune.keyframes:
             for view in self._views:
-                slope += self._of_view(view, gaussians, information)
+                slope += self._of_view(view, gaussians, information, half=half)
             return slope, information
         self._cells = self._cells or MapCells.of(gaussians)
         for view in self._views:
             rows = self._cells.seen(view.depth_m, view.T_world_camera, self._context.camera)
             of_view = np.zeros(len(rows))
-            slope[rows] += self._of_view(view, gaussians.select(rows), of_view)
+            slope[rows] += self._of_view(view, gaussians.select(rows), of_view, half=half)
             information[rows] += of_view
         return slope, information
 
-    def _of_view(self, view: PosedRgbd, gaussians: Gaussians, information: Array) -> NDArray[np.float32]:
-        """The slope by a view; its information is added."""
+    def _of_view(
+        self, view: PosedRgbd, gaussians: Gaussians, information: Array, *, half: int
+    ) -> NDArray[np.float32]:
+        """The slope by a half of a view; its information is added."""
+        pixels = self._halves[half] if view.mask is None else self._halves[half] & view.mask
         render = self._rasterizer.forward(
             gaussians,
             self._context.camera,
             se3.inverse(view.T_world_camera),
-            mask=view.mask,
+            mask=pixels,
             depth_kind=self._context.depth_kind,
         )
         off = np.clip(render.color - view.unit_color, -self._limit, self._limit)
-        if view.mask is not None:
-            off[~view.mask] = 0.0
+        off[~pixels] = 0.0
         slope = self._rasterizer.backward(off * self._precision).opacity_logits
         observations = np.zeros(len(gaussians), np.uint32)
         self._rasterizer.opacity_information(self._everywhere, self._nowhere, information, observations)
