@@ -43,6 +43,8 @@ $(STAMP): $(SOURCES)
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH_OPTIONS) "torch==2.13.0"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test,lint,dev]"
+	@# with PYTHONDONTWRITEBYTECODE, every process of a run would compile its modules again
+	$(BIN)/python -m compileall -q pipeline converters schemas
 	touch $(STAMP)
 
 demo: setup
