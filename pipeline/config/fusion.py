@@ -1,11 +1,30 @@
 """Settings of fusion."""
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
-from duagc.pipeline.config.training import LearningRates, MapLossConfig, SparseStepsConfig
+from duagc.pipeline.config.training import DepthKind, LearningRates, MapLossConfig, SparseStepsConfig
+
+
+class FinetuneSteps(NamedTuple):
+    """Steps of the finetuning of a fused map.
+
+    Attributes:
+        per_view: for each own view.
+        rate: first learning rates as a share of the mapper's.
+    """
+
+    per_view: int
+    rate: float
+
+
+FINETUNE: dict[DepthKind, FinetuneSteps] = {
+    "ray_plane": FinetuneSteps(per_view=8, rate=0.25),
+    "blended": FinetuneSteps(per_view=5, rate=0.35),
+}
+"""Where nothing else is set (docs/lab, layer-with-the-image)."""
 
 
 class FinetuneConfig(Config):
@@ -13,8 +32,8 @@ class FinetuneConfig(Config):
 
     keyframes: int = Field(default=48, ge=1)
     """Own keyframes up to which steps and views are at most those below; of a longer log, in proportion more."""
-    steps_per_view: int = Field(default=8, ge=0)
-    """Steps for each own view; 0: the fused map stays as fusion left it."""
+    steps_per_view: int | None = Field(default=None, ge=0)
+    """Steps for each own view; 0: the fused map stays as fusion left it. None: 5, or 8 where depth is exact."""
     steps_max: int = Field(default=600, ge=0)
     """Most steps on own views."""
     peer_share: float = Field(default=0.25, ge=0.0, le=1.0)
@@ -26,13 +45,25 @@ class FinetuneConfig(Config):
     at random, or those whose depth its information states best, or worst."""
     support_views: int = Field(default=40, ge=0)
     """Most tracked frames between keyframes that take part."""
-    rate: float = Field(default=0.25, gt=0.0)
-    """First learning rates as a share of the mapper's."""
+    rate: float | None = Field(default=None, gt=0.0)
+    """First learning rates as a share of the mapper's. None: 0.35, or 0.25 where depth is exact."""
     rate_decay: float = Field(default=0.1, gt=0.0, le=1.0)
     """They fall to this share: slowly, fast, slowly."""
     sparse: SparseStepsConfig = SparseStepsConfig()
     rates: LearningRates = LearningRates()
     loss: MapLossConfig = MapLossConfig()
+
+    def steps(self, depth: DepthKind) -> FinetuneSteps:
+        """Steps for each own view, and their rates.
+
+        Args:
+            depth: of the Gaussians, as it is drawn.
+        """
+        usual = FINETUNE[depth]
+        return FinetuneSteps(
+            usual.per_view if self.steps_per_view is None else self.steps_per_view,
+            usual.rate if self.rate is None else self.rate,
+        )
 
     def at_most(self, count: int, keyframes: int) -> int:
         """A number of steps or views, of a longer log in proportion more.

@@ -33,7 +33,7 @@ class TrainingSteps(NamedTuple):
 
 STEPS: dict[DepthKind, TrainingSteps] = {
     "ray_plane": TrainingSteps(keyframe=32, final=64, final_view=16),
-    "blended": TrainingSteps(keyframe=8, final=76, final_view=19),
+    "blended": TrainingSteps(keyframe=8, final=72, final_view=18),
 }
 """Where nothing else is set. On exact depth a step at a keyframe is worth more than one at the end; on noisy depth it
 is worth little (docs/lab, half-of-the-blocks)."""
@@ -108,10 +108,10 @@ class MappingConfig(Config):
     iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""
     final_iterations: int | None = Field(default=None, ge=0)
-    """Steps of the final optimization for every keyframe, at full size, shared by all views. None: 76, or 64 where
+    """Steps of the final optimization for every keyframe, at full size, shared by all views. None: 72, or 64 where
     depth is exact."""
     final_iterations_view: int | None = Field(default=None, ge=0)
-    """The same for every view, keyframe or supporting frame; the larger number of steps counts. None: 19, or 16 where
+    """The same for every view, keyframe or supporting frame; the larger number of steps counts. None: 18, or 16 where
     depth is exact."""
     final_iterations_max: int = 6000
     """Most steps of the final optimization of a tile."""

@@ -40,7 +40,8 @@ def steps_of_final_map(run: RunFolder, robot: RobotRun, images: Sequence[PosedRg
         robot: the robot.
         images: that its final map is trained on.
     """
-    return sum(num_steps(run.config.fusion.finetune, len(images), 1, len(robot.keyframes)))
+    config, depth = run.config.fusion.finetune, robot.own_map.depth
+    return sum(num_steps(config, len(images), 1, len(robot.keyframes), depth=depth))
 
 
 def camera_of(robot: RobotRun, source: Recording) -> PinholeCamera:

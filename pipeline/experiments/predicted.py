@@ -139,4 +139,5 @@ def _fusion_s(size: durations.Size, config: RunConfig) -> float:
     views = size["keyframes"] + min(mine.support_views, others)
     share = views / (size["keyframes"] + min(MappingConfig().support_views, others))
     trained_s = durations.fusion_s(size) - durations.FUSION_S
-    return durations.FUSION_S + trained_s * share * mine.steps_per_view / usual.steps_per_view
+    steps, usual_steps = (config.steps(durations.USUAL_DEPTH).per_view for config in (mine, usual))
+    return durations.FUSION_S + trained_s * share * steps / usual_steps

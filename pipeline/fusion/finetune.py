@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.fusion import FinetuneConfig
-from duagc.pipeline.config.training import LearningRates
+from duagc.pipeline.config.training import DepthKind, LearningRates
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
@@ -40,7 +40,9 @@ PEERS_UNTIL = 0.6
 PART = "training"
 
 
-def num_steps(config: FinetuneConfig, own_views: int, peer_views: int, keyframes: int = 0) -> tuple[int, int]:
+def num_steps(
+    config: FinetuneConfig, own_views: int, peer_views: int, keyframes: int = 0, *, depth: DepthKind
+) -> tuple[int, int]:
     """How many steps the training takes on own views and on views of peers' maps.
 
     Args:
@@ -48,8 +50,9 @@ def num_steps(config: FinetuneConfig, own_views: int, peer_views: int, keyframes
         own_views: how many there are.
         peer_views: how many there are.
         keyframes: of the robot.
+        depth: of a Gaussian at a pixel.
     """
-    steps = min(config.steps_per_view * own_views, config.at_most(config.steps_max, keyframes))
+    steps = min(config.steps(depth).per_view * own_views, config.at_most(config.steps_max, keyframes))
     return steps, round(config.peer_share * steps) if peer_views else 0
 
 
@@ -82,10 +85,11 @@ def finetune_map(
         As many Gaussians, in the same order, with the same ids and anchors.
     """
     config = context.config.finetune
-    own_steps, peer_steps = steps or num_steps(config, len(views), len(peer_views), keyframes)
+    usual = num_steps(config, len(views), len(peer_views), keyframes, depth=context.depth_kind)
+    own_steps, peer_steps = steps or usual
     if not own_steps or not len(gaussians):
         return gaussians
-    total = own_steps + peer_steps
+    total, rate = own_steps + peer_steps, config.steps(context.depth_kind).rate
     head = max(peer_steps, round(PEERS_UNTIL * total))
     training = _Training(gaussians, context, trained, in_parts=keyframes > config.keyframes)
     # the streams keep the names that they had: under other names they would draw other views
@@ -101,7 +105,7 @@ def finetune_map(
         number, visit = next(peer if of_peer else own)
         if step < first:
             continue  # its view was taken by the process before
-        share = config.rate * smoothstep_decay(step, total, config.rate_decay)
+        share = rate * smoothstep_decay(step, total, config.rate_decay)
         view = (peer_views if of_peer else views)[number]
         training.step(view, sparse.at(step, visit), config.rates.times(share))
         checkpoints.at(PART, step + 1, total, training.state)

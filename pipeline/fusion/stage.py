@@ -212,7 +212,7 @@ def _finetuned(
     """The fused map trained on own images and on renders of peers' maps; None if the settings have no steps."""
     config = context.config.finetune
     start, poses = FinalStart.of_fused(fused), result.T_world_keyframe_of
-    if not config.steps_per_view:
+    if not config.steps(context.depth_kind).per_view:
         return start, None
     shown: Sequence[PosedRgbd] = ()
     if config.peer_share:

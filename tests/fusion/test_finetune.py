@@ -255,12 +255,14 @@ def test_neighbors_views_teach_what_own_ones_do_not_see(spoiled: tuple[Gaussians
 
 def test_steps_are_shared_out() -> None:
     config = FinetuneConfig(steps_per_view=5, steps_max=100, peer_share=0.25)
-    assert num_steps(config, 4, 7) == (20, 5)
-    assert num_steps(config, 40, 7) == (100, 25)
-    assert num_steps(config, 40, 0) == (100, 0)
-    assert num_steps(config, 40, 7, keyframes=48) == (100, 25)
-    assert num_steps(config, 40, 7, keyframes=72) == (150, 38)  # a longer log has more
-    assert num_steps(config, 40, 7, keyframes=400) == (200, 50)
+    assert num_steps(config, 4, 7, depth="blended") == (20, 5)
+    assert num_steps(config, 40, 7, depth="blended") == (100, 25)
+    assert num_steps(config, 40, 0, depth="blended") == (100, 0)
+    assert num_steps(config, 40, 7, keyframes=48, depth="blended") == (100, 25)
+    assert num_steps(config, 40, 7, keyframes=72, depth="blended") == (150, 38)  # a longer log has more
+    assert num_steps(config, 40, 7, keyframes=400, depth="blended") == (200, 50)
+    noisy, exact = (num_steps(FinetuneConfig(), 10, 0, depth=depth)[0] for depth in ("blended", "ray_plane"))
+    assert noisy < exact  # where nothing is set
 
 
 def test_made_up_colors_of_a_neighbor_do_little_to_own_views(
