@@ -229,7 +229,7 @@ class _Both:
             candidates,
             _squared_apart(charts, *candidates, config),
             neighbors,
-            _squared_apart((charts[0], charts[0]), *neighbors, config),
+            neighbors_apart=_squared_apart((charts[0], charts[0]), *neighbors, config),
         )
 
     def in_colors(self, colors: ColorMap) -> _Both:
