@@ -106,31 +106,40 @@ def _shape_difference(charts: tuple[_Chart, _Chart], i: Rows, j: Rows) -> Array:
     return delta
 
 
-def _squared_apart(charts: tuple[_Chart, _Chart], i: Rows, j: Rows, config: MapMatching) -> Array:
-    """What places and shapes are of d_G^2 [m], of Gaussians i of the first chart and j of the second."""
-    a, b = charts
-    out = np.empty(len(i))
-    for part in row_blocks(len(i)):
-        rows = i[part], j[part]
-        delta = a.theta[rows[0], MEAN] - b.theta[rows[1], MEAN]
-        out[part] = np.sum(delta**2, axis=1) / config.position_scale_m**2
-        out[part] += config.beta_log_covariance * np.sum(_shape_difference(charts, *rows) ** 2, axis=1)
-    return out
+@dataclass(frozen=True)
+class _Compared:
+    """Pairs of Gaussians, rows i [m] of the first chart and j [m] of the second; what colors do not change is known.
 
+    `apart`: what places and shapes are of d_G^2 [m].
+    """
 
-def _distances(
-    charts: tuple[_Chart, _Chart], i: Rows, j: Rows, config: MapMatching, *, squared_apart: Array
-) -> Array:
-    """d_G [m] of Gaussians i of the first chart and j of the second, with what `_squared_apart` gave of them."""
-    a, b = charts
-    out = np.empty(len(i))
-    for part in row_blocks(len(i)):
-        rows = i[part], j[part]
-        color = (a.theta[rows[0], COLOR] - b.theta[rows[1], COLOR]) / SH_C0
-        opacity = a.theta[rows[0], OPACITY] - b.theta[rows[1], OPACITY]
-        squared = squared_apart[part] + config.beta_color * np.sum(color**2, axis=1)
-        out[part] = np.sqrt(squared + config.beta_opacity * opacity**2)
-    return out
+    charts: tuple[_Chart, _Chart]
+    i: Rows
+    j: Rows
+    apart: Array
+
+    @staticmethod
+    def of(charts: tuple[_Chart, _Chart], i: Rows, j: Rows, config: MapMatching) -> _Compared:
+        a, b = charts
+        apart = np.empty(len(i))
+        for part in row_blocks(len(i)):
+            delta = a.theta[i[part], MEAN] - b.theta[j[part], MEAN]
+            shape = _shape_difference(charts, i[part], j[part])
+            apart[part] = np.sum(delta**2, axis=1) / config.position_scale_m**2
+            apart[part] += config.beta_log_covariance * np.sum(shape**2, axis=1)
+        return _Compared(charts, i, j, apart)
+
+    def distances(self, config: MapMatching) -> Array:
+        """d_G [m]."""
+        a, b = self.charts
+        out = np.empty(len(self.i))
+        for part in row_blocks(len(self.i)):
+            i, j = self.i[part], self.j[part]
+            color = (a.theta[i, COLOR] - b.theta[j, COLOR]) / SH_C0
+            opacity = a.theta[i, OPACITY] - b.theta[j, OPACITY]
+            squared = self.apart[part] + config.beta_color * np.sum(color**2, axis=1)
+            out[part] = np.sqrt(squared + config.beta_opacity * opacity**2)
+        return out
 
 
 def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: MapMatching) -> Array:
@@ -146,19 +155,14 @@ def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: M
     used_a, i = np.unique(i, return_inverse=True)
     used_b, j = np.unique(j, return_inverse=True)
     charts = _Chart.of(a.theta[used_a], config), _Chart.of(b.theta[used_b], config)
-    return _distances(charts, i, j, config, squared_apart=_squared_apart(charts, i, j, config))
+    return _Compared.of(charts, i, j, config).distances(config)
 
 
 def threshold(own: Evidence, config: MapMatching) -> float:
     """tau_G of a map: how much its own neighboring Gaussians differ; 0 if no two are within the radius."""
     if len(own) < 2:
         return 0.0
-    chart = _Chart.of(own.theta, config)
-    charts, neighbors = (chart, chart), _neighbors(own.theta[:, MEAN], config.radius_m)
-    return _threshold(
-        _distances(charts, *neighbors, config, squared_apart=_squared_apart(charts, *neighbors, config)),
-        config,
-    )
+    return _threshold(_neighbors_compared(_Chart.of(own.theta, config), config), config)
 
 
 def _neighbors(means: Array, radius_m: float) -> tuple[Index, Index]:
@@ -169,9 +173,16 @@ def _neighbors(means: Array, radius_m: float) -> tuple[Index, Index]:
     return near, np.where(neighbor[near, 1] == near, neighbor[near, 0], neighbor[near, 1])
 
 
-def _threshold(between_neighbors: Array, config: MapMatching) -> float:
-    """tau_G by d_G between the neighbors of a map."""
-    return float(np.percentile(between_neighbors, config.percentile)) if len(between_neighbors) else 0.0
+def _neighbors_compared(chart: _Chart, config: MapMatching) -> _Compared:
+    """The Gaussians of a map that have a neighbor, with it."""
+    nobody = np.zeros(0, np.int64)
+    near = (nobody, nobody) if len(chart.theta) < 2 else _neighbors(chart.theta[:, MEAN], config.radius_m)
+    return _Compared.of((chart, chart), *near, config)
+
+
+def _threshold(neighbors: _Compared, config: MapMatching) -> float:
+    """tau_G of a map by its neighbors."""
+    return float(np.percentile(neighbors.distances(config), config.percentile)) if len(neighbors.i) else 0.0
 
 
 def match(own: Placed, peer: Placed, config: MapMatching) -> Index:
@@ -201,54 +212,40 @@ class _Both:
     Attributes:
         own: Gaussians of the computing robot.
         peer: of the other one, in its own camera's colors.
-        charts: of both.
-        candidates: rows of both.
-        apart: `_squared_apart` of the candidates.
-        neighbors: rows of the own map and of their nearest other ones; empty where there is but one Gaussian.
-        neighbors_apart: `_squared_apart` of the neighbors.
+        candidates: of both maps.
+        neighbors: of the own map.
     """
 
     own: Placed
     peer: Placed
-    charts: tuple[_Chart, _Chart]
-    candidates: tuple[Rows, Rows]
-    apart: Array
-    neighbors: tuple[Index, Index]
-    neighbors_apart: Array
+    candidates: _Compared
+    neighbors: _Compared
 
     @staticmethod
     def of(own: Placed, peer: Placed, config: MapMatching) -> _Both:
-        nobody = np.zeros(0, np.int64)
-        candidates = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
-        neighbors = (nobody, nobody) if len(own) < 2 else _neighbors(own.theta[:, MEAN], config.radius_m)
         charts = _Chart.of(own.theta, config), _Chart.of(peer.theta, config)
+        candidates = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
         return _Both(
             own,
             peer,
-            charts,
-            candidates,
-            _squared_apart(charts, *candidates, config),
-            neighbors,
-            neighbors_apart=_squared_apart((charts[0], charts[0]), *neighbors, config),
+            _Compared.of(charts, *candidates, config),
+            _neighbors_compared(charts[0], config),
         )
 
     def in_colors(self, colors: ColorMap) -> _Both:
         """With the chart of the peer's Gaussians in other colors."""
         if colors.is_identity:
             return self
-        theta = self.charts[1].theta.copy()
+        mine, theirs = self.candidates.charts
+        theta = theirs.theta.copy()
         theta[:, COLOR] = colors.to_other(self.peer.theta[:, COLOR])
-        return replace(self, charts=(self.charts[0], replace(self.charts[1], theta=theta)))
+        return replace(self, candidates=replace(self.candidates, charts=(mine, replace(theirs, theta=theta))))
 
     def matched(self, config: MapMatching) -> Index:
         """Ids of (own, peer), as `match`."""
         own, peer = self.own, self.peer
-        i, j = self.candidates
-        own_charts = self.charts[0], self.charts[0]
-        d = _distances(self.charts, i, j, config, squared_apart=self.apart)
-        limit = _threshold(
-            _distances(own_charts, *self.neighbors, config, squared_apart=self.neighbors_apart), config
-        )
+        i, j = self.candidates.i, self.candidates.j
+        d, limit = self.candidates.distances(config), _threshold(self.neighbors, config)
         best_of_own = _best_of_each(i, d, limit, lambda at: peer.ids[j[at]])
         best_of_peer = _best_of_each(j, d, limit, lambda at: own.ids[i[at]])
         mutual = np.intersect1d(best_of_own, best_of_peer)

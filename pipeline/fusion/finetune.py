@@ -85,8 +85,9 @@ def finetune_map(
         As many Gaussians, in the same order, with the same ids and anchors.
     """
     config = context.config.finetune
-    usual = num_steps(config, len(views), len(peer_views), keyframes, depth=context.depth_kind)
-    own_steps, peer_steps = steps or usual
+    own_steps, peer_steps = steps or num_steps(
+        config, len(views), len(peer_views), keyframes, depth=context.depth_kind
+    )
     if not own_steps or not len(gaussians):
         return gaussians
     total, rate = own_steps + peer_steps, config.steps(context.depth_kind).rate

@@ -34,6 +34,7 @@ LARGEST_PX2 = 1e12
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
+SAME_LAYER = 0.05  # relative difference of depth
 
 
 class Screen(NamedTuple):

@@ -34,7 +34,7 @@ from duagc.pipeline.kernels.arguments import (
     complaint_about,
     refuse_bad_image,
 )
-from duagc.pipeline.kernels.definition import TRANSMITTANCE_MIN
+from duagc.pipeline.kernels.definition import SAME_LAYER, TRANSMITTANCE_MIN
 from duagc.pipeline.kernels.outputs import NOTHING, empty, gradients_of, outputs_for, view_loss, zeros
 from duagc.pipeline.kernels.types import (
     FISHER_DIAGONAL_COLUMNS,
@@ -48,7 +48,6 @@ from duagc.pipeline.kernels.types import (
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 
 MAX_GAUSSIANS = 2**30
-SAME_LAYER = 0.05  # relative difference of depth
 
 _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)

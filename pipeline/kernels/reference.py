@@ -19,6 +19,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels.definition import (
     ALPHA_MAX,
     ALPHA_MIN,
+    SAME_LAYER,
     SCREEN_NUMBERS,
     TRANSMITTANCE_MIN,
     Channels,
@@ -84,7 +85,7 @@ class ReferenceRasterizer:
         *,
         depth_kind: DepthKind = "blended",
         mask: NDArray[np.bool_] | None = None,
-        tolerance: float = 0.05,
+        tolerance: float = SAME_LAYER,
     ) -> tuple[Render, NDArray[np.float64]]:
         """Draw them and the depth of one layer; see `Rasterizer.forward_with_layer`."""
         render = self.forward(gaussians, camera, T_camera_map, depth_kind=depth_kind, mask=mask)
