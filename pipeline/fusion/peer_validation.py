@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +106,7 @@ class ValidatedPeers:
     rejected: dict[tuple[str, str], Index]
     checks: tuple[PeerCheck, ...]
 
-    @property
+    @cached_property
     def uncontradicted(self) -> dict[str, Evidence]:
         """By name, in order, the evidence without what own images contradict."""
         against = self.contradicted
