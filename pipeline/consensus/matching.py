@@ -345,7 +345,7 @@ def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MapMatching) 
         i, j = i[known_i & known_j], j[known_i & known_j]
         parts.append((first[a] + i, first[b] + j))
         apart.append((evidence[a], i, evidence[b], j))
-    if not parts:
+    if not any(len(rows) for rows, _ in parts):
         none = np.zeros(0, np.int64)
         return Tracks(robots, none, none, none)
     i, j = (np.concatenate([p[k] for p in parts]).astype(np.int64) for k in range(2))

@@ -141,6 +141,14 @@ def test_tracks_run_over_all_robots():
     assert groups(evidence, pairs) == [{("alpha", 6), ("bravo", 7), ("charlie", 5)}]
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_robots_without_matches_have_no_tracks(count):
+    """Whether they have a map or, with `frontend.mapping_enabled=false`, none."""
+    evidence = {robot: identical(robot, range(count)) for robot in ("alpha", "bravo", "charlie")}
+    pairs = {("alpha", "bravo"): np.zeros((0, 2), np.int64)}
+    assert groups(evidence, pairs) == groups(evidence, {}) == []
+
+
 def test_a_track_with_two_gaussians_of_one_robot_loses_its_worst_pair():
     evidence = {
         "alpha": identical("alpha", [0, 1]),
