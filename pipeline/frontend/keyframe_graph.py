@@ -118,15 +118,19 @@ def predicted_overlap(reference: Reference, pyramid: RgbdPyramid, T_reference_ta
 
 
 def overlap(samples: ReferenceLevel, level: Level, T_reference_target: Array) -> float:
-    """Fraction of samples that a view would see on the same surface (within 10 % of depth).
+    """Fraction of samples that a view would see on the same surface (within 10 % of depth), and from the same side.
 
     Args:
         samples: of one level of a reference.
         level: of the view.
         T_reference_target: [4, 4], of the view.
     """
-    points = se3.transform(se3.inverse(T_reference_target), samples.points.astype(np.float64))
-    return projection.overlap(points, level.camera, inverse_depth=level.inverse_depth)
+    T_target_reference = se3.inverse(T_reference_target)
+    points = se3.transform(T_target_reference, samples.points.astype(np.float64))
+    normals = samples.normals.astype(np.float64) @ T_target_reference[:3, :3].T
+    faced = points[~projection.from_behind(points, normals)]
+    share = len(faced) / max(len(points), 1)
+    return share * projection.overlap(faced, level.camera, inverse_depth=level.inverse_depth)
 
 
 def solve_pose_graph(

@@ -17,6 +17,7 @@ Image = NDArray[np.floating]
 NEAR_M = 0.05  # points nearer to the image plane are not projected: their pixels mean little
 NEAR_GATE = 0.25  # of the depth: gates in meters of near surfaces are no larger
 SAME_SURFACE = 0.1  # relative difference of depth up to which two views show the same surface
+BEHIND = 0.2  # cosine between ray and normal from which on a surface is seen from behind; normals scatter
 
 FREE, ON_SURFACE, HIDDEN = 1, 0, -1  # where a point is as a view saw it: see `free_space`
 
@@ -96,6 +97,18 @@ def overlap(
     else:
         raise TypeError("overlap needs depth_m or inverse_depth")
     return float(np.count_nonzero(same)) / len(points_camera)
+
+
+def from_behind(points_camera: NDArray[np.floating], normals: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which surfaces a view would see from behind: what it sees there is another one, such as a wall's other side.
+
+    Args:
+        points_camera: [..., 3], meters, of surfaces that another view saw, in the frame of this one.
+        normals: [..., 3], unit length, same frame; they face the view that saw the surfaces.
+    """
+    away = np.sum(points_camera * normals, axis=-1)
+    squares = np.sum(points_camera * points_camera, axis=-1)
+    return np.asarray((away > 0) & (away * away > BEHIND * BEHIND * squares))
 
 
 def free_space(

@@ -9,6 +9,9 @@ For a sample p (reference frame) with normal n and intensity I, seen by the targ
 
 are each divided by their noise and weighted by Huber's function at a scale from the median absolute deviation.
 
+A sample whose surface the target would see from behind has no partner: there it sees another surface, such as the
+other side of a thin wall.
+
 An error of the depth of a sample moves q along the ray of the reference. With t the reference in the frame of the
 target and p_z the depth of the sample, the gray value that it meets has the standard deviation
 sigma_z |d gray / d q . t| / p_z, which `gray_noise_of_depth` adds to the noise of the gray residual (`_weighted`).
@@ -26,6 +29,7 @@ from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.depth_noise import DepthNoise
+from duagc.pipeline.geometry.projection import BEHIND
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma, median
 from duagc.pipeline.kernels.alignment import TILE_COLUMNS, TILE_ROWS
 from duagc.pipeline.registration.normal_equations import NormalEquations, SamplesSeen, System
@@ -156,6 +160,7 @@ def linearize_at(
         # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden
         free = off >= gate
     m = _rotated(T_target_reference, samples.normals.take(seen, axis=0).T)
+    agree &= ~_from_behind(q, m)
     if config.normal_gate_rad > 0:
         agree &= _normals_agree(level, u, v, m, limit_rad=config.normal_gate_rad)
     agreeing = np.flatnonzero(agree)
@@ -212,6 +217,13 @@ def _rotated(T: Floats, vectors: Floats) -> Floats:
     """Vectors [3, n], rotated."""
     x, y, z = vectors
     return np.stack([T[k, 0] * x + T[k, 1] * y + T[k, 2] * z for k in range(3)])
+
+
+def _from_behind(points: Floats, normals: Floats) -> NDArray[np.bool_]:
+    """`projection.from_behind` of points and normals [3, n], in float32 and in the order of the kernels."""
+    away = points[0] * normals[0] + points[1] * normals[1] + points[2] * normals[2]
+    squares = points[0] * points[0] + points[1] * points[1] + points[2] * points[2]
+    return (away > 0) & (away * away > np.float32(BEHIND) * np.float32(BEHIND) * squares)
 
 
 def _channels(level: Level) -> Floats:

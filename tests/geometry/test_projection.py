@@ -102,3 +102,15 @@ def test_the_largest_of_3x3_is_that_of_the_neighborhood() -> None:
         for column in range(9):
             block = image[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
             assert found[row, column] == block.max()
+
+
+def test_a_surface_is_seen_from_behind_where_its_normal_points_along_the_ray() -> None:
+    points = points_of(wall(2.0))
+    facing = np.broadcast_to([0.0, 0.0, -1.0], points.shape)
+    assert not projection.from_behind(points, facing).any()
+    assert projection.from_behind(points, -facing).all()
+    # a floor 1 m below, 30 m away, whose normal is off by 3 degrees: still seen from above; by 15 degrees not
+    floor = np.array([0.0, 1.0, 30.0])
+    for degrees, behind in ((0, False), (3, False), (15, True)):
+        turn = np.radians(degrees)
+        assert projection.from_behind(floor, np.array([0.0, -np.cos(turn), np.sin(turn)])) == behind

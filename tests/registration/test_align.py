@@ -1,8 +1,10 @@
 """Registration finds known motions, states its uncertainty, and does not call a failure a success."""
 
+import cv2
 import numpy as np
 import pytest
 
+from duagc.pipeline.frontend.keyframe_graph import overlap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import (
     Outcome,
@@ -90,6 +92,25 @@ def test_sparse_reference_works_across_a_wide_baseline(start):
     assert moved_m < 1e-3
     assert turned_rad < 1e-3
     assert 0.3 < result.overlap < 0.75
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_the_other_side_of_a_thin_wall_is_another_surface(sparse):
+    """Two cameras 2 m from a wall of 8 cm, one on each side: nearer than the gate, and both images are of a plane."""
+    rng = np.random.default_rng(0)
+    gray = cv2.GaussianBlur(rng.random((CAMERA.height, CAMERA.width)).astype(np.float32), None, 3)
+    wall = RgbdPyramid.build(gray, np.full(gray.shape, 2.0, np.float32), CAMERA)
+    mirrored = RgbdPyramid.build(gray[:, ::-1].copy(), np.full(gray.shape, 2.0, np.float32), CAMERA)
+    samples = Reference.sample(wall, 1000) if sparse else Reference.from_pyramid(wall, STRIDES)
+    T_front_back = np.diag([-1.0, 1.0, -1.0, 1.0])
+    T_front_back[2, 3] = 4.08
+    across = register(samples, mirrored, T_front_back)
+    assert across.view > 0.9  # the samples are in the image, as far away as what it shows
+    assert (across.outcome, across.overlap, across.samples) == (Outcome.LOW_OVERLAP, 0.0, 0)
+    aside = np.eye(4)
+    aside[0, 3] = 0.3
+    assert overlap(samples.levels[-1], mirrored.levels[-1], T_front_back) == 0.0
+    assert overlap(samples.levels[-1], wall.levels[-1], aside) > 0.8
 
 
 def test_reference_is_plain_arrays(reference, end):

@@ -77,7 +77,7 @@ def assert_same_equations(found: NormalEquations, wanted: NormalEquations) -> No
 def test_normal_equations_are_those_of_the_residuals(reference, target, settings):
     pyramid, config = TARGETS[target], SETTINGS[settings]
     for index in (0, 2):
-        for samples in (reference, without_sigmas(reference)):
+        for samples in (reference, without_sigmas(reference), scattered(reference)):
             at = (samples, pyramid, index, OFF)
             wanted = residuals.linearize_at(*at, exposure=EXPOSURE, config=config).system()
             found = compiled.linearize_at(*at, exposure=EXPOSURE, config=config)
@@ -108,6 +108,18 @@ def test_images_of_a_few_pixels_show_nothing(reference):
         nothing, TARGETS["plain"], 0, OFF, exposure=EXPOSURE, config=RegistrationConfig()
     )
     assert (empty.seen.agreeing, empty.seen.view, empty.gray.count) == (0, 0.0, 0)
+
+
+def scattered(reference: Reference) -> Reference:
+    """With normals in all directions: the target sees half of the samples from behind."""
+    rng = np.random.default_rng(5)
+
+    def turned(level: ReferenceLevel) -> ReferenceLevel:
+        normals = rng.standard_normal((len(level), 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return replace(level, normals=normals.astype(np.float32))
+
+    return Reference(tuple(turned(level) for level in reference.levels))
 
 
 def without_sigmas(reference: Reference) -> Reference:
