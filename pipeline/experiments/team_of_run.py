@@ -8,7 +8,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.consensus.matching import tracks
+from duagc.pipeline.consensus.tracks import tracks
 from duagc.pipeline.consensus.weighting import shared_evidence
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.evaluation.network import Session

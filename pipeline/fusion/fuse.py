@@ -26,8 +26,9 @@ from duagc.pipeline.base.row_blocks import in_blocks, row_blocks
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.consensus.matching import Pairs, tracks
-from duagc.pipeline.consensus.matching import Tracks as FoundTracks
+from duagc.pipeline.consensus.matching import Pairs
+from duagc.pipeline.consensus.tracks import Tracks as FoundTracks
+from duagc.pipeline.consensus.tracks import tracks
 from duagc.pipeline.fusion.association import EvidenceRows, TrackMembers, fused_moves
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces, select_unseen
