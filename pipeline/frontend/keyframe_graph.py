@@ -128,9 +128,7 @@ def overlap(samples: ReferenceLevel, level: Level, T_reference_target: Array) ->
     T_target_reference = se3.inverse(T_reference_target)
     points = se3.transform(T_target_reference, samples.points.astype(np.float64))
     normals = samples.normals.astype(np.float64) @ T_target_reference[:3, :3].T
-    faced = points[~projection.from_behind(points, normals)]
-    share = len(faced) / max(len(points), 1)
-    return share * projection.overlap(faced, level.camera, inverse_depth=level.inverse_depth)
+    return projection.overlap(points, level.camera, inverse_depth=level.inverse_depth, normals=normals)
 
 
 def solve_pose_graph(

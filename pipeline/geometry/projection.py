@@ -17,7 +17,7 @@ Image = NDArray[np.floating]
 NEAR_M = 0.05  # points nearer to the image plane are not projected: their pixels mean little
 NEAR_GATE = 0.25  # of the depth: gates in meters of near surfaces are no larger
 SAME_SURFACE = 0.1  # relative difference of depth up to which two views show the same surface
-BEHIND = 0.2  # cosine between ray and normal from which on a surface is seen from behind; normals scatter
+BEHIND_COSINE = 0.2  # between ray and normal; beyond, a surface is seen from behind: noisy normals scatter
 
 FREE, ON_SURFACE, HIDDEN = 1, 0, -1  # where a point is as a view saw it: see `free_space`
 
@@ -74,6 +74,7 @@ def overlap(
     *,
     depth_m: Image | None = None,
     inverse_depth: Image | None = None,
+    normals: Array | None = None,
 ) -> float:
     """Share of the points that a view sees on the same surface; 0 without points.
 
@@ -84,6 +85,8 @@ def overlap(
             depth.
         inverse_depth: instead of it, 1/m, 0 = unknown; a point may differ by SAME_SURFACE of the measured
             depth.
+        normals: [n, 3], unit length, of the points, in the frame of this view: points seen `from_behind` are not on the
+            same surface. None: not known.
     """
     if len(points_camera) == 0:
         return 0.0
@@ -96,6 +99,8 @@ def overlap(
         same = np.abs(depth_m[v, u] - z) < SAME_SURFACE * z
     else:
         raise TypeError("overlap needs depth_m or inverse_depth")
+    if normals is not None:
+        same &= ~from_behind(points_camera[index], normals[index])
     return float(np.count_nonzero(same)) / len(points_camera)
 
 
@@ -108,7 +113,7 @@ def from_behind(points_camera: NDArray[np.floating], normals: NDArray[np.floatin
     """
     away = np.sum(points_camera * normals, axis=-1)
     squares = np.sum(points_camera * points_camera, axis=-1)
-    return np.asarray((away > 0) & (away * away > BEHIND * BEHIND * squares))
+    return np.asarray((away > 0) & (away * away > BEHIND_COSINE**2 * squares))
 
 
 def free_space(

@@ -35,7 +35,7 @@ class AlignmentSettings:
         depth_gate_m: absolute gate of depth.
         depth_gate_relative: the same as a share of the depth.
         gate_sigmas: the same in sigmas of measured depth.
-        behind: cosine between ray and normal beyond which a surface is seen from behind.
+        behind_squared: square of the cosine between ray and normal beyond which a surface is seen from behind.
         min_normal_cosine: of the angle between normals, where those of the target are given.
         sigma_base_m: of the noise of depth.
         sigma_quadratic_per_m: of the noise of depth.
@@ -55,7 +55,7 @@ class AlignmentSettings:
     depth_gate_m: float
     depth_gate_relative: float
     gate_sigmas: float
-    behind: float
+    behind_squared: float
     min_normal_cosine: float
     sigma_base_m: float
     sigma_quadratic_per_m: float

@@ -10,7 +10,7 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry.depth_noise import NEAREST_M
-from duagc.pipeline.geometry.projection import BEHIND
+from duagc.pipeline.geometry.projection import BEHIND_COSINE
 from duagc.pipeline.kernels import alignment
 from duagc.pipeline.registration.normal_equations import NormalEquations, SamplesSeen, System
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
@@ -119,7 +119,7 @@ def _settings(config: RegistrationConfig) -> alignment.AlignmentSettings:
         depth_gate_m=config.depth_gate_m,
         depth_gate_relative=config.depth_gate_relative,
         gate_sigmas=GATE_SIGMAS,
-        behind=BEHIND,
+        behind_squared=BEHIND_COSINE**2,
         min_normal_cosine=float(np.cos(config.normal_gate_rad)),
         sigma_base_m=config.depth_sigma_base_m,
         sigma_quadratic_per_m=config.depth_sigma_quadratic_per_m,

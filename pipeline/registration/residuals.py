@@ -29,7 +29,7 @@ from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.depth_noise import DepthNoise
-from duagc.pipeline.geometry.projection import BEHIND
+from duagc.pipeline.geometry.projection import from_behind
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma, median
 from duagc.pipeline.kernels.alignment import TILE_COLUMNS, TILE_ROWS
 from duagc.pipeline.registration.normal_equations import NormalEquations, SamplesSeen, System
@@ -160,7 +160,7 @@ def linearize_at(
         # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden
         free = off >= gate
     m = _rotated(T_target_reference, samples.normals.take(seen, axis=0).T)
-    agree &= ~_from_behind(q, m)
+    agree &= ~from_behind(q.T, m.T)
     if config.normal_gate_rad > 0:
         agree &= _normals_agree(level, u, v, m, limit_rad=config.normal_gate_rad)
     agreeing = np.flatnonzero(agree)
@@ -217,13 +217,6 @@ def _rotated(T: Floats, vectors: Floats) -> Floats:
     """Vectors [3, n], rotated."""
     x, y, z = vectors
     return np.stack([T[k, 0] * x + T[k, 1] * y + T[k, 2] * z for k in range(3)])
-
-
-def _from_behind(points: Floats, normals: Floats) -> NDArray[np.bool_]:
-    """`projection.from_behind` of points and normals [3, n], in float32 and in the order of the kernels."""
-    away = points[0] * normals[0] + points[1] * normals[1] + points[2] * normals[2]
-    squares = points[0] * points[0] + points[1] * points[1] + points[2] * points[2]
-    return (away > 0) & (away * away > np.float32(BEHIND) * np.float32(BEHIND) * squares)
 
 
 def _channels(level: Level) -> Floats:

@@ -154,14 +154,13 @@ NO_INLINE static void rotate_normals(const float* __restrict T, const float* __r
 }
 
 // Samples whose surface the target would see from behind do not agree: what it sees there is another one.
-NO_INLINE static void compare_sides(float limit, const float* __restrict mx, const float* __restrict my, const float* __restrict mz, int count,
-                                    SampleBatch* __restrict b) {
-    const float limit2 = limit * limit;
+NO_INLINE static void compare_sides(float behind_squared, const float* __restrict mx, const float* __restrict my,
+                                    const float* __restrict mz, int count, SampleBatch* __restrict b) {
     for (int i = 0; i < count; i++) {
         const float qx = b->qx[i], qy = b->qy[i], qz = b->qz[i];
         const float away = qx * mx[i] + qy * my[i] + qz * mz[i];
         const float squares = qx * qx + qy * qy + qz * qz;
-        const bool behind = (away > 0.0f) & (away * away > limit2 * squares);
+        const bool behind = (away > 0.0f) & (away * away > behind_squared * squares);
         b->flags[i] &= behind ? ~(AGREES | HAS_GRAY) : ~0;
     }
 }
@@ -240,7 +239,7 @@ static void view_samples(const TargetImages& image, const float* T, Exposure exp
             std::memset(b.noise, 0, sizeof b.noise);
         judge(image, settings, count, &b);
         rotate_normals(T, samples.normals + 3 * begin, count, at(MX), at(MY), at(MZ));
-        compare_sides(settings.behind, at(MX), at(MY), at(MZ), count, &b);
+        compare_sides(settings.behind_squared, at(MX), at(MY), at(MZ), count, &b);
         if (image.normals) compare_normals(image, settings.min_normal_cosine, all, begin, count, b);
         if (settings.min_gradient > 0.0f) compare_gradients(settings.min_gradient, count, b);
         set_sigmas(image, settings, samples.depth_sigmas ? samples.depth_sigmas + begin : nullptr, count, &b);
