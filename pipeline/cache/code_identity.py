@@ -25,7 +25,7 @@ PACKAGE = "duagc"
 DATA_SUFFIXES = (".binpb", ".j2", ".css")
 SHOWN_ONLY = frozenset({"rich", "typer", "lazy_loader", "tomlkit"})
 """Libraries that no result depends on."""
-_RULES = f"1 {PYTHON}"  # of what is counted; part of every stored digest
+_RULES = f"2 {PYTHON}"  # of what is counted; part of every stored digest
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,8 @@ class CodeReader:
         self._new = False
         self._texts: dict[Path, _Text] = {}
         self._paths: dict[str, Path | None] = {}
+        self._files: dict[tuple[str, ...], set[Path]] = {}
+        self._data: dict[Path, list[Path]] = {}
         self._versions: dict[str, CodeVersion] = {}
 
     def version_of(self, entry: str) -> CodeVersion:
@@ -143,13 +145,20 @@ class CodeReader:
 
     def _files_of(self, names: tuple[str, ...]) -> set[Path]:
         """Files of modules, of the packages that they are in, and the data files of these packages."""
-        modules = set[str]()
-        for name in names:
-            words = name.split(".")
-            modules |= {".".join(words[:end]) for end in range(1, len(words) + 1)}
-        files = {path for module in modules if (path := self._path_of(module)) is not None}
-        packages = {path.parent for path in files if path.name == "__init__.py" and path.parent != self.root}
-        return files | {p for folder in packages for p in folder.iterdir() if p.suffix in DATA_SUFFIXES}
+        if names not in self._files:
+            modules = set[str]()
+            for name in names:
+                words = name.split(".")
+                modules |= {".".join(words[:end]) for end in range(1, len(words) + 1)}
+            files = {path for module in modules if (path := self._path_of(module)) is not None}
+            packages = {path.parent for path in files if path.name == "__init__.py"} - {self.root}
+            self._files[names] = files | {path for folder in packages for path in self._data_of(folder)}
+        return self._files[names]
+
+    def _data_of(self, folder: Path) -> list[Path]:
+        if folder not in self._data:
+            self._data[folder] = [path for path in folder.iterdir() if path.suffix in DATA_SUFFIXES]
+        return self._data[folder]
 
     def _text(self, path: Path) -> _Text:
         if path not in self._texts:
@@ -208,32 +217,62 @@ def _tree(path: Path, raw: bytes) -> ast.Module:
 
 def _count(body: list[ast.stmt]) -> _Text:
     """Digest and imports of statements."""
-    names, libraries = set[str](), set[str]()
-    kept = _Stripped().visit(ast.Module(body=list(body), type_ignores=[]))
-    for node in ast.walk(kept):
-        found: list[str] = []
-        if isinstance(node, ast.Import):
-            found = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found = [f"{node.module}.{alias.name}" for alias in node.names]
-        names.update(name for name in found if name.split(".")[0] == PACKAGE)
-        libraries.update(name.split(".")[0] for name in found)
-    libraries -= {PACKAGE, *SHOWN_ONLY, *sys.stdlib_module_names}
-    return _Text(_digest(ast.dump(kept).encode()), tuple(sorted(names)), tuple(sorted(libraries)))
+    counted = _Counted()
+    counted.add_all(body)
+    libraries = counted.libraries - {PACKAGE, *SHOWN_ONLY, *sys.stdlib_module_names}
+    digest = _digest("\n".join(counted.parts).encode())
+    return _Text(digest, tuple(sorted(counted.names)), tuple(sorted(libraries)))
 
 
-class _Stripped(ast.NodeTransformer):
-    """Takes out what computes nothing: texts that stand alone, and what only type checkers read."""
+class _Counted:
+    """Syntax trees as text, one part after another, without what computes nothing; and what they import.
 
-    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
-        """Drop documentation."""
-        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-        return None if alone else self.generic_visit(node)
+    One pass in place of a transformer, `ast.dump` and a walk: every run begins with it.
+    """
 
-    def visit_If(self, node: ast.If) -> ast.AST | None:
-        """Drop `if TYPE_CHECKING:`."""
-        checked = isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING" and not node.orelse
-        return None if checked else self.generic_visit(node)
+    def __init__(self) -> None:
+        self.parts: list[str] = []
+        self.names, self.libraries = set[str](), set[str]()
+
+    def add_all(self, values: list[Any]) -> None:
+        """Add the nodes or plain values of a list that compute something.
+
+        Args:
+            values: of one field of a node.
+        """
+        self.parts.append("[")
+        for value in values:
+            if not _computes_nothing(value):
+                self._add(value)
+        self.parts.append("]")
+
+    def _add(self, value: Any) -> None:
+        if type(value) is list:
+            self.add_all(value)
+        elif not isinstance(value, ast.AST):
+            self.parts.append(repr(value))
+        else:
+            if isinstance(value, ast.Import | ast.ImportFrom):
+                self._note_import(value)
+            self.parts.append(type(value).__name__)
+            for name in value._fields:
+                self._add(getattr(value, name, None))
+
+    def _note_import(self, node: ast.Import | ast.ImportFrom) -> None:
+        found = [alias.name for alias in node.names]
+        if isinstance(node, ast.ImportFrom):
+            found = [f"{node.module}.{name}" for name in found] if node.module else []
+        self.names.update(name for name in found if name.split(".")[0] == PACKAGE)
+        self.libraries.update(name.split(".")[0] for name in found)
+
+
+def _computes_nothing(node: Any) -> bool:
+    """Whether a statement is a text that stands alone, or what only type checkers read."""
+    if isinstance(node, ast.Expr):
+        return isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    if isinstance(node, ast.If):
+        return isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING" and not node.orelse
+    return False
 
 
 def _digest(data: bytes) -> str:
