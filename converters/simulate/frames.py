@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -294,21 +295,22 @@ class RenderPool:
         return self
 
     def images(self, jobs: list[FrameJob]) -> Iterator[FrameImages]:
-        """The images of all jobs, in their order; a few are in work ahead of the one that is asked for.
+        """The images of all jobs, in their order; a few are in work ahead of the one that is asked for, from now on.
 
         Args:
             jobs: the frames.
         """
         if self._pool is None:
-            yield from map(FrameRenderer(self.scene, self.settings).render, jobs)
-            return
-        waiting: deque[Future[FrameImages]] = deque()
-        for job in jobs:
-            waiting.append(self._pool.submit(_render, job))
-            if len(waiting) > 4 * self.workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+            return map(FrameRenderer(self.scene, self.settings).render, jobs)
+        left = iter(jobs)
+        ahead = deque(self._pool.submit(_render, job) for job in islice(left, 4 * self.workers))
+        return self._in_order(ahead, left)
+
+    def _in_order(self, ahead: deque[Future[FrameImages]], left: Iterator[FrameJob]) -> Iterator[FrameImages]:
+        assert self._pool is not None
+        while ahead:
+            ahead.extend(self._pool.submit(_render, job) for job in islice(left, 1))
+            yield ahead.popleft().result()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -126,19 +126,26 @@ def simulate(
             scene, parameters.get("up", ""), seed, Path(cache), as_meshes=settings.needs_triangles
         )
         team = _Team(settings, simulated, camera_of(size), paths)
-        shared = team.report_paths(recording)
-        points = simulated.points()
-        recording.add_geometry(lambda path: write_points(path, *points))
         figures = _movers(settings, simulated, team.trajectories, Path(cache))
-        title = f"{parameters['scene']}, {paradigm}, seed {seed}: neighbors share {shared:.2f} of the view"
-        sheet = Preview(
-            title, team.names, team.trajectories, [mover.poses for mover in figures], kept=team.kept_frames
-        )
-        team.report_sensors(recording)
         frame_settings = FrameSettings.of(settings, team.camera, figures, team.rig)
         with RenderPool(simulated, frame_settings, workers) as pool:
             jobs = team.jobs()
-            team.write(recording, track(pool.images(jobs), "simulate", len(jobs)), sheet)
+            images = pool.images(jobs)  # begun; what follows is done meanwhile
+            shared = team.report_paths(recording)
+            points = simulated.points()
+            recording.add_geometry(lambda path: write_points(path, *points))
+            title = (
+                f"{parameters['scene']}, {paradigm}, seed {seed}: neighbors share {shared:.2f} of the view"
+            )
+            sheet = Preview(
+                title,
+                team.names,
+                team.trajectories,
+                [mover.poses for mover in figures],
+                kept=team.kept_frames,
+            )
+            team.report_sensors(recording)
+            team.write(recording, track(images, "simulate", len(jobs)), sheet)
         if preview is not None:
             sheet.write(preview, points[0], points[2])
 
