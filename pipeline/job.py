@@ -22,7 +22,14 @@ from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.chain import Chain, Prepared
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.preparation import RobotProcesses, Say, carrier_of, with_keyframes, workers_that_fit
+from duagc.pipeline.preparation import (
+    FusionPool,
+    RobotProcesses,
+    Say,
+    carrier_of,
+    with_keyframes,
+    workers_that_fit,
+)
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
@@ -168,12 +175,14 @@ class Job:
         workers = cache(lambda: self._fitting(self._sizes(self.recording.robots), READER_SHARE))
         cameras = self._calibration.get("calibration", {}).get("cameras")
         notes = {"calibration": _digest_of(cameras)} if cameras else {}
-        with self._matching(prepared, workers) as matched:
-            if plan.has(stages.EXCHANGE):
-                exchange = self._noted(chain.exchange, prepared)
-                done.append(exchange)
-            if plan.has(stages.FUSION):
-                done += self._fused(chain, prepared, exchange)
+        computed = self._computes_exchange(prepared)
+        with self._matching(prepared, workers, computed) as matched:
+            with self._starting_fusion(prepared, computed) as ready:
+                if plan.has(stages.EXCHANGE):
+                    exchange = self._noted(chain.exchange, prepared)
+                    done.append(exchange)
+                if plan.has(stages.FUSION):
+                    done += self._fused(chain, prepared, exchange, ready)
             self._write(done)
             if self._watch.follower is not None and plan.has(stages.FUSION):
                 self._watch.follower.finished(self.folder, self.recording.path)
@@ -185,17 +194,31 @@ class Job:
         self._write([*done, *readers])
         return [*self._before, *done, *readers]
 
-    def _matching(
-        self, prepared: dict[str, Prepared], workers: Callable[[], int]
-    ) -> AbstractContextManager[Callable[[], dict[str, MatchedViews]]]:
-        """The part of the evaluation that needs no more than the front ends, next to an exchange that is computed."""
-        if self.carrier.looking or not self.plan.has(stages.EVALUATION):
-            return nullcontext(dict)
+    def _computes_exchange(self, prepared: dict[str, Prepared]) -> bool:
+        """Whether the exchange is part of the plan and nowhere stored."""
+        if self.carrier.looking or not self.plan.has(stages.EXCHANGE):
+            return False
         looking = Chain(self.recording, self._looking_carrier(), self.digests)
         _, absent = self._looked_up([stages.EXCHANGE.name], lambda _: looking.exchange(prepared))
-        if not absent or workers() == 1:
+        return bool(absent)
+
+    def _matching(
+        self, prepared: dict[str, Prepared], workers: Callable[[], int], computed: bool
+    ) -> AbstractContextManager[Callable[[], dict[str, MatchedViews]]]:
+        """The part of the evaluation that needs no more than the front ends, next to an exchange that is computed."""
+        if not computed or not self.plan.has(stages.EVALUATION) or workers() == 1:
             return nullcontext(dict)
         return self._processes().matching({name: self.recording.log(name) for name in prepared})
+
+    def _starting_fusion(
+        self, prepared: dict[str, Prepared], computed: bool
+    ) -> AbstractContextManager[FusionPool | None]:
+        """The processes of the fusion, which start next to an exchange that is computed; None: there are none."""
+        if not computed or not self.plan.has(stages.FUSION):
+            return nullcontext(None)
+        sizes, quiet = list(self._sizes(prepared).values()), replace(self.carrier, say=lambda line: None)
+        workers = workers_that_fit(sizes, quiet, self.plan.workers, share=FUSION_SHARE)  # said when it begins
+        return self._processes().starting_fusion(len(prepared), workers) if workers > 1 else nullcontext(None)
 
     def _shown(
         self, chain: Chain, done: list[Carried], notes: dict[str, str], workers: Callable[[], int]
@@ -248,8 +271,10 @@ class Job:
             self.missing.append(error.key)
             raise
 
-    def _fused(self, chain: Chain, prepared: dict[str, Prepared], exchange: Carried) -> list[Carried]:
-        """The fused map of every robot; `workers` at a time in processes of their own."""
+    def _fused(
+        self, chain: Chain, prepared: dict[str, Prepared], exchange: Carried, ready: FusionPool | None
+    ) -> list[Carried]:
+        """The fused map of every robot; `workers` at a time in processes of their own, which may be ready."""
         looking = Chain(self.recording, self._looking_carrier(), self.digests)
         found, absent = self._looked_up(
             prepared, lambda name: looking.fusion(name, prepared[name], exchange, threads=1)
@@ -261,7 +286,8 @@ class Job:
             self.log(f"fusion: {len(absent)} robots, {workers} at a time")
             if self._time_left is not None:
                 self._time_left.begin(stages.FUSION.name)
-            fused = self._processes().fuse({name: prepared[name] for name in absent}, exchange, workers)
+            wanted = {name: prepared[name] for name in absent}
+            fused = self._processes().fuse(wanted, exchange, workers, ready)
         threads, done = threads_per_worker(1), []
         for name, robot in prepared.items():
             done.append(fused.get(name) or chain.fusion(name, robot, exchange, threads=threads))
@@ -306,9 +332,10 @@ class Job:
             sizes = with_keyframes(self._sizes(absent), self.recording, self.config.frontend.keyframes)
             workers = self._fitting(sizes)
             self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
-            self._check_registration(absent)
             self._time_left = self._expected(sizes, found, workers)
-            found |= self._processes().prepare(absent, workers, alone=alone, hear=self._hear)
+            check = partial(self._check_registration, absent)
+            prepare = partial(self._processes().prepare, hear=self._hear, meanwhile=check)
+            found |= prepare(absent, workers, alone=alone)
         else:
             self.log(f"front end and information: {len(found)} robots from the store")
             self._time_left = self._expected({}, found, self.plan.workers)

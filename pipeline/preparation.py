@@ -6,9 +6,10 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
 
 MEASURED = 20  # results of front ends that memory is estimated from
+FUSION = "duagc.pipeline.fusion.stage"
 LONG_FRAMES = 100  # a shorter log is done before its time left matters
 Say = Callable[[str], None]
 
@@ -160,6 +162,23 @@ def workers_that_fit(
 
 
 @dataclass(frozen=True)
+class FusionPool:
+    """Processes that wait for the fusion of robots.
+
+    Attributes:
+        pool: of them.
+        share: of the machine's threads.
+        robots: that they are for.
+        workers: how many they are.
+    """
+
+    pool: ProcessPoolExecutor
+    share: ThreadShare
+    robots: int
+    workers: int
+
+
+@dataclass(frozen=True)
 class RobotProcesses:
     """Stages of robots, each robot by one of some processes.
 
@@ -182,7 +201,13 @@ class RobotProcesses:
     versions: Mapping[str, CodeVersion] = field(default_factory=dict)
 
     def prepare(
-        self, robots: Sequence[str], workers: int, *, alone: bool, hear: worker_reports.Hear
+        self,
+        robots: Sequence[str],
+        workers: int,
+        *,
+        alone: bool,
+        hear: worker_reports.Hear,
+        meanwhile: Callable[[], None] = lambda: None,
     ) -> dict[str, Prepared]:
         """Front end and information of robots; by name of the component.
 
@@ -191,6 +216,7 @@ class RobotProcesses:
             workers: how many at the same time.
             alone: leave the information out.
             hear: gets steps of front ends, in another thread.
+            meanwhile: is done here while the processes start.
         """
         found, share = dict[str, Prepared](), ThreadShare(workers, len(robots))
         with (
@@ -200,6 +226,7 @@ class RobotProcesses:
             tasks = [pool.submit(self.prepare_one, robot, alone=alone) for robot in robots]
             for task in tasks:
                 task.add_done_callback(share.done)
+            meanwhile()
             for task in tasks:
                 found |= task.result()
         return found
@@ -219,22 +246,44 @@ class RobotProcesses:
             if heard.follower is not None:
                 heard.follower.close()
 
-    def fuse(self, robots: Mapping[str, Prepared], exchange: Carried, workers: int) -> dict[str, Carried]:
+    @contextmanager
+    def starting_fusion(self, robots: int, workers: int) -> Iterator[FusionPool]:
+        """Processes for fused maps, which start and import what they need while this one does something else.
+
+        Args:
+            robots: how many.
+            workers: how many at the same time.
+        """
+        share = ThreadShare(workers, robots)
+        with worker_pool(workers, keep_share, share.handed) as pool:
+            for _ in range(workers):
+                pool.submit(import_module, FUSION)
+            yield FusionPool(pool, share, robots, workers)
+
+    def fuse(
+        self,
+        robots: Mapping[str, Prepared],
+        exchange: Carried,
+        workers: int,
+        ready: FusionPool | None = None,
+    ) -> dict[str, Carried]:
         """The fused maps of robots, by name.
 
         Args:
             robots: with their own results, by name.
             exchange: of the team.
             workers: how many at the same time.
+            ready: processes that wait for it; used if they are as many.
         """
-        share = ThreadShare(workers, len(robots))
-        with worker_pool(workers, keep_share, share.handed) as pool:
-            tasks = {
-                name: pool.submit(self.fuse_one, name, robot, exchange) for name, robot in robots.items()
-            }
-            for task in tasks.values():
-                task.add_done_callback(share.done)
-            return {name: task.result() for name, task in tasks.items()}
+        if ready is None or (ready.robots, ready.workers) != (len(robots), workers):
+            with self.starting_fusion(len(robots), workers) as started:
+                return self.fuse(robots, exchange, workers, started)
+        tasks = {
+            name: ready.pool.submit(self.fuse_one, name, robot, exchange) for name, robot in robots.items()
+        }
+        for task in tasks.values():
+            task.add_done_callback(ready.share.done)
+        return {name: task.result() for name, task in tasks.items()}
 
     def fuse_one(self, name: str, robot: Prepared, exchange: Carried) -> Carried:
         """The fused map of one robot, in a process of its own.
