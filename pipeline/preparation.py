@@ -34,7 +34,7 @@ from duagc.pipeline.runs import stages
 
 MEASURED = 20  # results of front ends that memory is estimated from
 FUSION = "duagc.pipeline.fusion.stage"
-LONG_FRAMES = 100  # a shorter log is done before its time left matters
+LONG_FRAMES = 1000  # a shorter log is tracked, and its keyframes are counted, within seconds
 Say = Callable[[str], None]
 
 
