@@ -16,7 +16,7 @@ from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
-from duagc.pipeline.registration import RgbdPyramid, geometric_verification
+from duagc.pipeline.registration import Reference, RgbdPyramid, geometric_verification
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.geometric_verification import (
     Failure,
@@ -25,6 +25,8 @@ from duagc.pipeline.registration.geometric_verification import (
     VerificationView,
 )
 from duagc.pipeline.registration.gicp import register_points
+
+MOST_SAMPLES = (5.0, 95.0)  # percentiles: a few samples that are not true move nothing
 
 
 class Verdict(Enum):
@@ -93,6 +95,7 @@ def verify(
     if config.method != "features":
         return _verified_by_gicp(candidate, own, own_pyramid, sample, config=config, rng=rng)
     faced, faced_by_peer = rectified or (None, None)
+    config = _within_view(config, own_pyramid, sample.reference)
     found = geometric_verification.verify(
         VerificationView(own, images=lambda: own_pyramid, rectified=faced),
         VerificationView(sample.features, sample.reference, rectified=faced_by_peer),
@@ -107,6 +110,27 @@ def verify(
     elif found.features.T_first_second is not None and found.features.accepted:
         tentative = LoopClosure(*candidate.ends, found.features.T_first_second, np.zeros((6, 6)))
     return Verified(verdict, found.features.matches, found.features.inliers, detail, closure, tentative)
+
+
+def _within_view(
+    config: VerificationConfig, pyramid: RgbdPyramid, reference: Reference
+) -> VerificationConfig:
+    """The limits with overlaps of what a camera can see at all, if its view is narrower than the neighbor's.
+
+    Overlap is a share of the neighbor's samples, which fill its view. What nine of ten of them span along either axis
+    is less than the view of a camera that is alike, so that nothing changes then.
+    """
+    camera, points = pyramid.levels[0].camera, reference.levels[0].points.astype(np.float64)
+    ahead = points[points[:, 2] > 0]
+    if not len(ahead):
+        return config
+    low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], MOST_SAMPLES, axis=0)
+    view = np.array([camera.width / camera.fx, camera.height / camera.fy])
+    share = min(1.0, float(np.prod(view) / max(np.prod(high - low), np.finfo(float).tiny)))
+    if share == 1.0:
+        return config
+    within = config.registration.model_copy(update={"min_overlap": share * config.registration.min_overlap})
+    return config.model_copy(update={"min_overlap": share * config.min_overlap, "registration": within})
 
 
 def _verified_by_gicp(

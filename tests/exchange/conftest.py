@@ -37,9 +37,11 @@ def textures() -> Array:
     return walls
 
 
-def view(T_world_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+def view(
+    T_world_camera: Array, camera: PinholeCamera = CAMERA
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Color and depth of the room from inside."""
-    rays = CAMERA.rays() @ T_world_camera[:3, :3].T
+    rays = camera.rays() @ T_world_camera[:3, :3].T
     origin = T_world_camera[:3, 3]
     with np.errstate(divide="ignore"):
         reach = (np.sign(rays) * HALF_M - origin) / rays

@@ -20,9 +20,11 @@ from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.exchange.wire import loop_closing_wire
+from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration import features
+from duagc.pipeline.registration import Reference, RgbdPyramid, features
 from duagc.pipeline.runs.keyframe_images import Images
+from tests.exchange.conftest import CAMERA, path, view
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +122,32 @@ def test_a_view_that_shows_little_of_the_other_is_enough(robots: dict) -> None:
     refused = verified(Candidate(*pair, 0), alpha, sample, strict)
     assert refused.verdict is Verdict.NOT_REGISTERED
     assert "low_overlap" in refused.detail
+
+
+@pytest.mark.parametrize("own_is_narrow", [True, False])
+def test_a_narrow_camera_and_a_wide_one_find_each_other(own_is_narrow: bool) -> None:
+    """The narrow one sees a tenth of what the wide one sees, and all of that is in the wide one's view."""
+    narrow = replace(CAMERA, fx=3.2 * CAMERA.fx, fy=3.2 * CAMERA.fy)
+    cameras, T = (narrow, CAMERA) if own_is_narrow else (CAMERA, narrow), path(0.0, 2)
+    seen = [view(pose, camera) for pose, camera in zip([T[0], turned(T[0])], cameras, strict=True)]
+    own, theirs = (
+        features.extract(*images, camera, 400) for images, camera in zip(seen, cameras, strict=True)
+    )
+    pyramid, other = (
+        RgbdPyramid.build(*images, camera) for images, camera in zip(seen, cameras, strict=True)
+    )
+    sample = KeyframeSample(0, theirs, Reference.sample(other, 2000))
+    rng = random_streams.generator(0, "test")
+    result = verify(Candidate(0, 0, 20), own, pyramid, sample, config=VerificationConfig(), rng=rng)
+    assert result.closure is not None, (result.verdict, result.detail)
+    moved_m, moved_rad = se3.distance(result.closure.T_own_peer, se3.inverse(T[0]) @ turned(T[0]))
+    assert moved_m < 0.02
+    assert moved_rad < 0.01
+
+
+def turned(T_world_camera: np.ndarray) -> np.ndarray:
+    """A pose that looks a little elsewhere from a little beside."""
+    return T_world_camera @ se3.exp(np.array([0.05, 0.03, 0.0, 0.02, 0.03, 0.05]))
 
 
 def test_different_places_are_refused(robots: dict, make_robot: Any) -> None:
