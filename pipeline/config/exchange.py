@@ -74,7 +74,7 @@ class VerificationConfig(GeometricVerificationConfig):
     samples: int = Field(default=2000, ge=50)
     """Points with normal and intensity of the neighbor's keyframe used by the registration."""
     min_overlap: float = Field(default=0.2, ge=0.0, le=1.0)
-    """Overlap that the registration must find."""
+    """Overlap that the registration must find, of what the own camera can see of the neighbor's samples."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)
     """Largest translation by which the registration may change what RANSAC found."""
     registration: PeerRegistrationConfig = PeerRegistrationConfig()
