@@ -228,10 +228,11 @@ def test_a_sound_recording_raises_no_alarm(sound: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("change", "calibrate"), [(nothing, False), (late_depth, False), (late_depth, True)])
-def test_a_run_says_before_it_begins_that_depth_is_of_another_time(
+def test_a_run_says_as_it_begins_that_depth_is_of_another_time(
     sound: Path, tmp_path: Path, change: Change, calibrate: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(*args: Any, **kwargs: Any) -> Any:
+    def stop(*args: Any, meanwhile: Callable[[], None], **kwargs: Any) -> Any:
+        meanwhile()
         raise DuagError("stopped")
 
     monkeypatch.setattr(job.RobotProcesses, "prepare", stop)

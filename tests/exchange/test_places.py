@@ -146,7 +146,7 @@ def test_a_narrow_camera_and_a_wide_one_find_each_other(own_is_narrow: bool) -> 
 
 
 def turned(T_world_camera: np.ndarray) -> np.ndarray:
-    """A pose that looks a little elsewhere from a little beside."""
+    """A pose a little to the side, which looks a little elsewhere."""
     return T_world_camera @ se3.exp(np.array([0.05, 0.03, 0.0, 0.02, 0.03, 0.05]))
 
 
