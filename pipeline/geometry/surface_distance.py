@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.row_blocks import row_blocks
 from duagc.pipeline.base.shelf import ShelvedList
@@ -52,22 +50,25 @@ def median_distances(
         views: the more, the less noise is left.
         gate_m: a surface farther than this from a point belongs to something else.
     """
-    near = ShelvedList(in_order(partial(_near_surface, points, camera, gate_m), views))
+    near = ShelvedList(_near_surfaces(points, camera, views, gate_m))
     counts, median_m = np.zeros(len(points), np.int64), np.zeros(len(points))
     for block in row_blocks(len(points)):
         counts[block], median_m[block] = _medians(near, block)
     return counts, median_m
 
 
-def _near_surface(points: Array, camera: PinholeCamera, gate_m: float, view: DepthView) -> Distances:
-    """The rows of the points near a surface that a view measured, ascending, and signed distances."""
+def _near_surfaces(
+    points: Array, camera: PinholeCamera, views: Iterable[DepthView], gate_m: float
+) -> Iterator[Distances]:
+    """Of every view the rows of the points near a surface that it measured, ascending, and signed distances."""
     import cv2
 
-    smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(view.depth_m), MEDIAN_PX), dtype=np.float32)
-    seen = se3.transform(se3.inverse(view.T_map_camera), points)
-    rows, distance_m = _from_tangent_planes(seen, smooth, camera)
-    near = np.abs(distance_m) < gate_m
-    return rows[near], distance_m[near]
+    for view in views:
+        smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(view.depth_m), MEDIAN_PX), dtype=np.float32)
+        seen = se3.transform(se3.inverse(view.T_map_camera), points)
+        rows, distance_m = _from_tangent_planes(seen, smooth, camera)
+        near = np.abs(distance_m) < gate_m
+        yield rows[near], distance_m[near]
 
 
 def _medians(near: Sequence[Distances], block: slice) -> tuple[NDArray[np.int64], Array]:
