@@ -92,10 +92,10 @@ def verify(
     Returns:
         The verdict, and the loop closure T_own_peer with its information if the verdict is KEPT.
     """
+    config = _within_view(config, own_pyramid, sample.reference)
     if config.method != "features":
         return _verified_by_gicp(candidate, own, own_pyramid, sample, config=config, rng=rng)
     faced, faced_by_peer = rectified or (None, None)
-    config = _within_view(config, own_pyramid, sample.reference)
     found = geometric_verification.verify(
         VerificationView(own, images=lambda: own_pyramid, rectified=faced),
         VerificationView(sample.features, sample.reference, rectified=faced_by_peer),
