@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -16,20 +16,13 @@ from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Step
-from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError
+from duagc.pipeline.cache.carrier import Carried, NotStoredError
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.chain import Chain, Prepared
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.preparation import (
-    FusionPool,
-    RobotProcesses,
-    Say,
-    carrier_of,
-    with_keyframes,
-    workers_that_fit,
-)
+from duagc.pipeline.preparation import FusionPool, RobotProcesses, Say, with_keyframes, workers_that_fit
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
@@ -81,7 +74,7 @@ class Job:
             looking: only look what is there: nothing is computed or written.
         """
         self.recording, self.folder, self.config, self.plan, self.log = recording, folder, config, plan, log
-        self.carrier = carrier_of(
+        self.carrier = preparation.carrier_of(
             folder, config, plan, log=log, place=place, looking=looking, begun=self._announce
         )
         self.store = self.carrier.store
@@ -198,7 +191,7 @@ class Job:
         """Whether the exchange is part of the plan and nowhere stored."""
         if self.carrier.looking or not self.plan.has(stages.EXCHANGE):
             return False
-        looking = Chain(self.recording, self._looking_carrier(), self.digests)
+        looking = self._looking()
         _, absent = self._looked_up([stages.EXCHANGE.name], lambda _: looking.exchange(prepared))
         return bool(absent)
 
@@ -232,8 +225,7 @@ class Job:
         wanted = {stages.REPORT: of_report, stages.VIEW: notes}
         wanted = {stage: more for stage, more in wanted.items() if self.plan.has(stage)}
         if len(wanted) > 1 and not self.carrier.looking:
-            looking = Chain(self.recording, self._looking_carrier(), self.digests)
-            view = partial(looking.reader, stages.VIEW, done, notes, workers)
+            view = partial(self._looking().reader, stages.VIEW, done, notes, workers)
             _, absent = self._looked_up([stages.VIEW.name], lambda _: view())
             if absent and workers() > 1:
                 with self._processes().viewing(done, notes) as drawn:
@@ -275,7 +267,7 @@ class Job:
         self, chain: Chain, prepared: dict[str, Prepared], exchange: Carried, ready: FusionPool | None
     ) -> list[Carried]:
         """The fused map of every robot; `workers` at a time in processes of their own, which may be ready."""
-        looking = Chain(self.recording, self._looking_carrier(), self.digests)
+        looking = self._looking()
         found, absent = self._looked_up(
             prepared, lambda name: looking.fusion(name, prepared[name], exchange, threads=1)
         )
@@ -319,7 +311,7 @@ class Job:
     def _prepared(self, chain: Chain) -> dict[str, Prepared]:
         """Every robot with its own results, by name; `workers` at a time in processes of their own."""
         alone = not self.plan.has(stages.INFORMATION)
-        looking = Chain(self.recording, self._looking_carrier(), self.digests)
+        looking = self._looking()
         stored, absent = self._looked_up(
             self.recording.robots, lambda robot: looking.robot(robot, threads=1, alone=alone)
         )
@@ -333,7 +325,8 @@ class Job:
             workers = self._fitting(sizes)
             self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
             self._time_left = self._expected(sizes, found, workers)
-            check = partial(self._check_registration, absent)
+            logs = [] if self.plan.calibrate else [self.recording.log(robot) for robot in absent]
+            check = partial(preparation.say_registration, logs, self.log)
             prepare = partial(self._processes().prepare, hear=self._hear, meanwhile=check)
             found |= prepare(absent, workers, alone=alone)
         else:
@@ -344,16 +337,6 @@ class Job:
                 f"warning: {name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
             )
         return dict(sorted(found.items()))
-
-    def _check_registration(self, robots: Sequence[str]) -> None:
-        """Say where color and depth do not belong together, unless they are calibrated."""
-        if self.plan.calibrate:
-            return
-        from duagc.pipeline.checks.check import check_registration
-
-        for findings in in_order(check_registration, [self.recording.log(robot) for robot in robots]):
-            for finding in findings:
-                self.log(finding.line())
 
     def _expected(
         self, sizes: dict[str, dict[str, int]], found: dict[str, Prepared], workers: int
@@ -374,20 +357,14 @@ class Job:
         self._known_sizes |= dict(zip(new, found, strict=True))
         return {name: self._known_sizes[robot_of(name)] for name in robots}
 
-    def _looking_carrier(self) -> Carrier:
-        return replace(self.carrier, looking=True)
+    def _looking(self) -> Chain:
+        """The stages as they are stored: nothing is computed."""
+        return Chain(self.recording, replace(self.carrier, looking=True), self.digests)
 
     def _is_stored(self) -> bool:
         """Whether nothing would be computed."""
-        looking = Job(
-            self.recording,
-            self.folder,
-            self.config,
-            self.plan,
-            log=self.log,
-            place=self._place,
-            looking=True,
-        )
+        of = self.recording, self.folder, self.config, self.plan
+        looking = Job(*of, log=self.log, place=self._place, looking=True)
         try:
             looking.stages()
         except NotStoredError:

@@ -135,6 +135,20 @@ def with_keyframes(
     return dict(zip(sizes, in_order(counted, sizes), strict=True))
 
 
+def say_registration(logs: Sequence[Path], log: Say) -> None:
+    """Say where color and depth do not belong together.
+
+    Args:
+        logs: of robots that are not calibrated.
+        log: gets a line for every finding.
+    """
+    from duagc.pipeline.checks.check import check_registration
+
+    for findings in in_order(check_registration, logs):
+        for finding in findings:
+            log(finding.line())
+
+
 def workers_that_fit(
     sizes: Sequence[dict[str, int]], carrier: Carrier, asked: int, *, share: float = 1.0
 ) -> int:
