@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.exchange.neighbor import Neighbor
-from duagc.pipeline.exchange.wire import state_wire
-from duagc.pipeline.exchange.wire.state_wire import Anchors
+from duagc.pipeline.exchange.wire import anchors_wire, state_wire
+from duagc.pipeline.exchange.wire.anchors_wire import Anchors
 from duagc.pipeline.network.packets import Kind, MalformedError
 
 MOVED = 1e-3
@@ -69,7 +69,7 @@ class CurrentPoses:
             poses: own ones, the first keyframe at the origin.
         """
         if self.own not in n.passed.current:
-            payload = _VERSION.pack(FROM_FIRST) + state_wire.write_anchors(poses)
+            payload = _VERSION.pack(FROM_FIRST) + anchors_wire.write_anchors(poses)
             n.passed.current[self.own] = (
                 FROM_FIRST,
                 send(n, Kind.CURRENT_POSES, state_wire.write_labeled(0, self.team, payload)),
@@ -89,7 +89,7 @@ class CurrentPoses:
             if moved < MOVED or round_index < last.round + LEAST_ROUNDS:
                 return
         payload = state_wire.write_labeled(
-            revoked, self.team, _VERSION.pack(round_index) + state_wire.write_anchors(poses)
+            revoked, self.team, _VERSION.pack(round_index) + anchors_wire.write_anchors(poses)
         )
         self._newest[self.own] = _Version(round_index, revoked, poses, payload)
 
@@ -105,7 +105,7 @@ class CurrentPoses:
         revoked, rest = state_wire.read_labeled(payload, self.team)
         if len(rest) < _VERSION.size:
             raise MalformedError("current poses: cut short")
-        poses = state_wire.read_anchors(rest[_VERSION.size :], self.team)
+        poses = anchors_wire.read_anchors(rest[_VERSION.size :], self.team)
         if poses.owner == self.own:
             raise MalformedError("current poses: a neighbor speaks for this robot")
         version = _Version(_VERSION.unpack_from(rest)[0], revoked, poses, payload)
@@ -151,7 +151,7 @@ class CurrentPoses:
             T_world_first: where the first keyframe of a member was placed, [4, 4].
         """
         placed = {
-            owner: Anchors(owner, T_world_first(owner) @ poses.T_common_keyframe, poses.T_map_first)
+            owner: replace(poses, T_common_keyframe=T_world_first(owner) @ poses.T_common_keyframe)
             for owner, poses in sorted(self._from_first.items())
             if owner in members
         }

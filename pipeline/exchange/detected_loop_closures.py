@@ -49,6 +49,7 @@ from duagc.pipeline.exchange.wire.loop_closing_wire import (
     RectifiedFeatures,
     Verdicts,
 )
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.posegraph.loop_closures import Consistency, Group, KeyframePoses, consistent
@@ -141,6 +142,7 @@ class Verifier(LoopClosureProtocol):
         super().__init__(database.graph.robot, peer)
         self.database, self.config, self.seed = database, database.config, seed
         self.planner: Planner | None = None
+        self.peer_camera: PinholeCamera | None = None
         self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbor
         # of its keyframes, until decided: compact descriptors, those that resemble no own one, samples that arrived
         self.compact: list[Descriptors] = []
@@ -176,6 +178,7 @@ class Verifier(LoopClosureProtocol):
     def _choose(self, received: DescriptorSet, send: Send) -> None:
         """Score all pairs of keyframes and request the samples of the most promising."""
         self.peer_keyframes = KeyframePoses(received.T_first_keyframe, received.drift)
+        self.peer_camera = received.camera
         self.compact = received.descriptors
         c = self.config.places
         candidates, self.unlike = place_recognition.scored(
@@ -265,12 +268,14 @@ class Verifier(LoopClosureProtocol):
         """Further candidates near the loop closures that were verified, or near those that nearly were."""
         assert self.planner is not None
         assert self.peer_keyframes is not None
+        assert self.peer_camera is not None
         results = [t.result for t in self.tried]
         verified = [r.closure for r in results if r.closure]
         near = verified or [r.tentative for r in results if r.tentative]
         if not near or len(verified) >= self.config.places.enough_closures:
             return []
-        self.planner.expect(self.database.overlaps(near, self.peer_keyframes), self._score)
+        overlaps = self.database.overlaps(near, self.peer_keyframes, self.peer_camera)
+        self.planner.expect(overlaps, self._score)
         return self.planner.next()
 
     def _score(self, own_keyframe: int, peer_keyframe: int) -> int:

@@ -17,6 +17,7 @@ from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.view_overlap import overlaps
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import DescriptorSet, KeyframeSample
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.loop_closures import KeyframePoses, drift
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
 from duagc.pipeline.posegraph.surface_agreement import coarse_depth, surface_agreement
@@ -94,9 +95,18 @@ class KeyframeDatabase:
             T_ownmap_peer=T_first_peer,
         )
 
-    def overlaps(self, closures: Sequence[LoopClosure], peer: KeyframePoses) -> dict[tuple[int, int], float]:
+    def overlaps(
+        self, closures: Sequence[LoopClosure], peer: KeyframePoses, peer_camera: PinholeCamera
+    ) -> dict[tuple[int, int], float]:
         """How much of own views a neighbor's keyframes should see, by both, near loop closures with it."""
-        return overlaps(closures, self._coarse_depths, self.data.camera, own=self.graph.from_first, peer=peer)
+        return overlaps(
+            closures,
+            self._coarse_depths,
+            self.data.camera,
+            peer_camera,
+            own=self.graph.from_first,
+            peer=peer,
+        )
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
         """Images of a keyframe at several resolutions."""
@@ -118,7 +128,7 @@ class KeyframeDatabase:
         """What a neighbor gets to recognize places."""
         most = self.config.places.features_per_place
         compact = [f.descriptors[:most] for f in self.features]
-        return DescriptorSet(compact, self.graph.T_first_keyframe, self.graph.drift)
+        return DescriptorSet(compact, self.graph.T_first_keyframe, self.graph.drift, self.data.camera)
 
     def sample(self, keyframe: int) -> KeyframeSample:
         """What a neighbor gets to verify loop closures with one keyframe."""

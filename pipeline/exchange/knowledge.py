@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.exchange.wire import evidence_wire, state_wire
-from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList
+from duagc.pipeline.exchange.wire import anchors_wire, evidence_wire, state_wire
+from duagc.pipeline.exchange.wire.anchors_wire import Anchors, PlacedKeyframes
+from duagc.pipeline.exchange.wire.state_wire import PairList
 from duagc.pipeline.network.packets import EVIDENCE_HEAD_BYTES, Kind, MalformedError
 
 Records = NDArray[Any]
@@ -103,7 +104,7 @@ class Knowledge:
 
     def take_anchors(self, payload: bytes) -> int:
         """Take agreed poses, if they are new; returns their owner."""
-        anchors = state_wire.read_anchors(payload, self.team)
+        anchors = anchors_wire.read_anchors(payload, self.team)
         if anchors.owner == self.own:
             raise MalformedError("anchors: a neighbor speaks for this robot")
         if anchors.owner not in self.anchors:
@@ -157,7 +158,7 @@ class Knowledge:
             return None
         return evidence_wire.read_evidence_head(self.kind, chunks[0][:EVIDENCE_HEAD_BYTES], self.team)[1:]
 
-    def sound_records(self, poses: Anchors) -> Records:
+    def sound_records(self, poses: PlacedKeyframes) -> Records:
         """`records` of an owner whose anchor is among its poses."""
         records = self.records(poses.owner)
         return records[records["anchor"] < len(poses.T_common_keyframe)]

@@ -14,7 +14,8 @@ from duagc.pipeline.exchange.evidence_records import to_evidence
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.verification import Verdict
-from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList
+from duagc.pipeline.exchange.wire.anchors_wire import Anchors
+from duagc.pipeline.exchange.wire.state_wire import PairList
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
@@ -46,6 +47,7 @@ def result_of(agent: MapAgent) -> SessionResult:
         evidence={name: SHELF.put(to_evidence(name, records)) for name, records in evidence.items()},
         # a robot that sent no kind of depth sent no Gaussian either: nothing of it is rendered
         depth_of={name: depths[name] or agent.data.depth for name in evidence},
+        camera_of={team[i]: placed[i].camera for i in others if i in placed},
         arrived={team[i]: agent.config.evidence_share * knowledge.share(i) for i in others if i in placed},
         pairs=_pairs(agent, placed),
         closures=tuple(_closures(agent)),
@@ -74,7 +76,7 @@ def _placed(agent: MapAgent) -> dict[int, Anchors]:
     T_own = alignment.T_world_first(agent.own) @ agent.graph.T_first_keyframe
     if agent.poses is not None:
         T_own = agent.poses.T_world_keyframe
-    own = Anchors(agent.own, T_own, agent.graph.T_map_keyframe[0])
+    own = Anchors(agent.own, T_own, agent.graph.T_map_keyframe[0], agent.data.camera)
     newest = agent.evidence.current.known(alignment.revoked, alignment.members, alignment.T_world_first)
     return {**newest, agent.own: own, **agent.knowledge.anchors}
 

@@ -30,8 +30,9 @@ from duagc.pipeline.exchange.knowledge import Knowledge
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.shared_data import SendTo
 from duagc.pipeline.exchange.solvers import Matcher
-from duagc.pipeline.exchange.wire import evidence_wire, state_wire
-from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList, State
+from duagc.pipeline.exchange.wire import anchors_wire, evidence_wire, state_wire
+from duagc.pipeline.exchange.wire.anchors_wire import Anchors, PlacedKeyframes
+from duagc.pipeline.exchange.wire.state_wire import PairList, State
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.messages import Arrival
 from duagc.pipeline.network.packets import Kind, MalformedError
@@ -174,7 +175,7 @@ class Sharing:
             revoked: links that do not count.
             round_index: the current round.
         """
-        poses = self._as_sent(Anchors(self.own, T_common_keyframe, T_map_first))
+        poses = self._as_sent(self._anchors(T_common_keyframe, T_map_first))
         self.current.offer(poses, revoked, round_index)
 
     def add_poses(self, T_common_keyframe: Array, T_map_first: Array) -> None:
@@ -184,9 +185,9 @@ class Sharing:
             T_common_keyframe: [n, 4, 4], own keyframes in the common frame of the consensus.
             T_map_first: [4, 4], the first keyframe in the own map.
         """
-        anchors = Anchors(self.own, T_common_keyframe, T_map_first)
+        anchors = self._anchors(T_common_keyframe, T_map_first)
         self.knowledge.anchors[self.own] = anchors
-        self.knowledge.anchors_bytes[self.own] = state_wire.write_anchors(self._as_sent(anchors))
+        self.knowledge.anchors_bytes[self.own] = anchors_wire.write_anchors(self._as_sent(anchors))
 
     def complete(self, members: Sequence[int]) -> bool:
         """Whether agreed poses, evidence and matches of all members are here."""
@@ -249,7 +250,10 @@ class Sharing:
     def _from_first(self) -> Anchors:
         """Own keyframes as seen from the first."""
         T_map_keyframe = self.data.T_map_keyframe
-        return Anchors(self.own, se3.inverse(T_map_keyframe[0]) @ T_map_keyframe, T_map_keyframe[0])
+        return self._anchors(se3.inverse(T_map_keyframe[0]) @ T_map_keyframe, T_map_keyframe[0])
+
+    def _anchors(self, T_common_keyframe: Array, T_map_first: Array) -> Anchors:
+        return Anchors(self.own, T_common_keyframe, T_map_first, self.data.camera)
 
     def _send_evidence(
         self, send: SendTo, n: Neighbor, members: Sequence[int], T_world_map: Array | None
@@ -292,7 +296,7 @@ class Sharing:
 
     # --- matching
 
-    def matched(self, a: Anchors, b: Anchors) -> NDArray[np.int64]:
+    def matched(self, a: PlacedKeyframes, b: PlacedKeyframes) -> NDArray[np.int64]:
         """Ids [n, 2] of matched Gaussians of two robots, of what is here of them.
 
         Args:
@@ -323,8 +327,7 @@ class Sharing:
         """
         if not self.is_here(other):
             return None
-        nowhere = np.eye(4)
-        return self.matched(Anchors(self.own, T_own, nowhere), Anchors(other, T_other, nowhere))
+        return self.matched(PlacedKeyframes(self.own, T_own), PlacedKeyframes(other, T_other))
 
     def positions(self, owner: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array, Array]:
         """Anchors [p] of Gaussians, their means [p, 3] and the information of these [p, 3, 3], in the anchors' frames.
@@ -347,7 +350,7 @@ class Sharing:
             information,
         )
 
-    def _placed(self, poses: Anchors) -> tuple[str, NDArray[Any], Array]:
+    def _placed(self, poses: PlacedKeyframes) -> tuple[str, NDArray[Any], Array]:
         """Name of a robot, what is here of its evidence, and its poses."""
         own = poses.owner == self.own
         records = self.own_records()[self._sent()] if own else self.knowledge.sound_records(poses)

@@ -32,6 +32,7 @@ def overlaps(
     closures: Iterable[LoopClosure],
     coarse_m: Sequence[NDArray[np.float32]],
     camera: PinholeCamera,
+    peer_camera: PinholeCamera,
     *,
     own: KeyframePoses,
     peer: KeyframePoses,
@@ -39,12 +40,13 @@ def overlaps(
     """How much of their views two robots' keyframes share, for all pairs near a loop closure on both paths.
 
     The relative pose of a pair is that of the loop closure with least drift between. Of a neighbor's keyframe no depth
-    is needed; its camera is taken to see as wide as the own one.
+    is needed.
 
     Args:
         closures: verified, from the own side.
         coarse_m: `surface_agreement.coarse_depth` of the own keyframes.
         camera: of the whole own images.
+        peer_camera: of the neighbor's.
         own: own keyframes, in any one frame.
         peer: the neighbor's keyframes, likewise.
     Returns:
@@ -66,18 +68,21 @@ def overlaps(
         T_own_closure = se3.inverse(own.T_frame_keyframe[i]) @ own.T_frame_keyframe[ends[0]]
         T_closure_peer = se3.inverse(peer.T_frame_keyframe[ends[1]]) @ peer.T_frame_keyframe[sorted(by_peer)]
         T_own_peer = T_own_closure @ np.array([c.T_own_peer for c in by]) @ T_closure_peer
-        shares = shared_view(coarse_m[i], camera, T_own_peer)
+        shares = shared_view(coarse_m[i], camera, T_own_peer, peer_camera)
         out |= {(i, j): share for j, share in zip(sorted(by_peer), shares.tolist(), strict=True)}
     return out
 
 
-def shared_view(coarse_m: NDArray[np.float32], camera: PinholeCamera, T_own_peer: Array) -> Array:
+def shared_view(
+    coarse_m: NDArray[np.float32], camera: PinholeCamera, T_own_peer: Array, peer_camera: PinholeCamera
+) -> Array:
     """How much an own view shares with other views, seen from directions and distances that are not too different.
 
     Args:
         coarse_m: `surface_agreement.coarse_depth` of the own view.
-        camera: of the whole images, of all views.
+        camera: of the whole image of the own view.
         T_own_peer: [k, 4, 4], the other views.
+        peer_camera: of these.
     Returns:
         [k], 0 to 1: the share of the own points that the other view sees, or if larger the share of the other image
         that they fall into.
@@ -91,16 +96,20 @@ def shared_view(coarse_m: NDArray[np.float32], camera: PinholeCamera, T_own_peer
     points = back_project(camera, column * scale, row * scale, sparse[row, column].astype(np.float64))
     seen = se3.transform(se3.inverse(T_own_peer), points)
     in_front = seen[..., 2] > NEAREST_M
-    u, v = np.moveaxis(camera.project(np.where(in_front[..., None], seen, [0.0, 0.0, 1.0])), -1, 0)
+    u, v = np.moveaxis(peer_camera.project(np.where(in_front[..., None], seen, [0.0, 0.0, 1.0])), -1, 0)
     own_m, peer_m = np.linalg.norm(points, axis=-1), np.linalg.norm(seen, axis=-1)
     along = np.sum(points * (points - T_own_peer[:, None, :3, 3]), axis=-1)
-    good = in_front & inside(u, v, (camera.height, camera.width)) & (along > LEAST_COSINE * own_m * peer_m)
+    good = (
+        in_front
+        & inside(u, v, (peer_camera.height, peer_camera.width))
+        & (along > LEAST_COSINE * own_m * peer_m)
+    )
     good &= (peer_m < MOST_SCALE * own_m) & (own_m < MOST_SCALE * peer_m)
     covered = np.zeros((len(T_own_peer), *CELLS), dtype=bool)
     view, point = np.nonzero(good)
     at = [
         (x[view, point] * (n / size)).astype(np.int64)
-        for x, n, size in ((v, CELLS[0], camera.height), (u, CELLS[1], camera.width))
+        for x, n, size in ((v, CELLS[0], peer_camera.height), (u, CELLS[1], peer_camera.width))
     ]
     covered[view, at[0], at[1]] = True
     return np.maximum(good.mean(axis=-1), covered.mean(axis=(1, 2)))

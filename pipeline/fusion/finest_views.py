@@ -29,6 +29,7 @@ from duagc.pipeline.fusion.coverage import DepthImages, known_surfaces
 from duagc.pipeline.fusion.final_start import FinalStart
 from duagc.pipeline.fusion.fuse import FusedMap
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import visible
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import gaussians_of, mean_block
@@ -45,6 +46,7 @@ def from_finest_views(
     factor: float,
     depth_images: DepthImages,
     depth_kinds: Mapping[str, DepthKind],
+    cameras: Mapping[str, PinholeCamera],
 ) -> FinalStart:
     """A fused map with peers' Gaussians in the place of own ones where a peer's keyframes saw the surface finer.
 
@@ -57,6 +59,7 @@ def from_finest_views(
         factor: by which a peer's resolution must exceed the own one.
         depth_images: of own keyframes.
         depth_kinds: as the peers' maps were made, by name.
+        cameras: of the peers, by name.
     Returns:
         Without the own Gaussians that were replaced; ids of what comes in follow the largest of the fused map.
     """
@@ -70,7 +73,13 @@ def from_finest_views(
         maps[name] = gaussians_of(theirs.ids, theirs.anchors, fused.colors[name].parameters(theirs))
     SHELF.sweep(heap=True)
     found = _resolutions(
-        maps, robot, T_world_keyframe, context=context, depth_images=depth_images, depth_kinds=depth_kinds
+        maps,
+        robot,
+        T_world_keyframe,
+        context=context,
+        depth_images=depth_images,
+        depth_kinds=depth_kinds,
+        cameras=cameras,
     )
     kept = np.ones(len(fused.gaussians), bool)
     kept[own_rows[_seen_finer(found[robot], robot, factor)]] = False
@@ -95,23 +104,26 @@ def _resolutions(
     context: MapContext,
     depth_images: DepthImages,
     depth_kinds: Mapping[str, DepthKind],
+    cameras: Mapping[str, PinholeCamera],
 ) -> dict[str, dict[str, Array]]:
     """By owner of the Gaussians and by robot that saw them: the finest resolution at each [n]."""
     means = {name: np.asarray(g.means, dtype=np.float64) for name, g in maps.items()}
     long = len(T_world_keyframe[robot]) > context.config.finetune.keyframes
     cells = {name: MapCells.of(g) for name, g in maps.items()} if long else {}
-    empty = np.zeros((context.camera.height, context.camera.width), np.float32)
     # a peer draws where it is opaque, not next to it
     exact = context.config.model_copy(update={"explained_px": 0})
     found: dict[str, dict[str, Array]] = {name: {} for name in maps}
     for seen_by, gaussians in maps.items():
         poses = T_world_keyframe[seen_by]
         if seen_by == robot:
-            drawn = known_surfaces(gaussians, poses, depth_images, context)
+            seeing, measured = context, depth_images
         else:
-            theirs = replace(context, config=exact, depth_kind=depth_kinds[seen_by])
-            drawn = known_surfaces(gaussians, poses, ((k, empty) for k in range(len(poses))), theirs)
-        for name, finest in finest_resolution(means, poses, drawn, context, cells=cells).items():
+            camera = cameras[seen_by]
+            seeing = replace(context, camera=camera, config=exact, depth_kind=depth_kinds[seen_by])
+            empty = np.zeros((camera.height, camera.width), np.float32)
+            measured = ((k, empty) for k in range(len(poses)))
+        drawn = known_surfaces(gaussians, poses, measured, seeing)
+        for name, finest in finest_resolution(means, poses, drawn, seeing, cells=cells).items():
             found[name][seen_by] = finest
     return found
 
@@ -135,7 +147,7 @@ def finest_resolution(
         means: places [n, 3] in the world, meters, by any name.
         T_world_keyframe: [k, 4, 4], of the keyframes.
         surfaces: depth of known surfaces by keyframe (`known_surfaces`).
-        context: camera and tolerances.
+        context: their camera, and tolerances.
         cells: of Gaussians at these places, so that not all are looked at in every image; None: all are.
     """
     config, camera = context.config, context.camera

@@ -108,7 +108,7 @@ def finetune_map(
             continue  # its view was taken by the process before
         share = rate * smoothstep_decay(step, total, config.rate_decay)
         view = (peer_views if of_peer else views)[number]
-        training.step(view, sparse.at(step, visit), config.rates.times(share))
+        training.step(view, sparse.at(step, visit, view.camera), config.rates.times(share))
         checkpoints.at(PART, step + 1, total, training.state)
     return training.gaussians
 
@@ -146,11 +146,11 @@ class _Training:
     def step(self, view: PosedRgbd, looked_at: LookedAt, rates: LearningRates) -> None:
         """Take a step on a view."""
         image = looked_at.of(TrainingView.of(view, self._take.loss))
-        rows, seen = None, self.gaussians
+        rows, seen, camera = None, self.gaussians, view.camera or self._camera
         if self._cells is not None:
-            rows = self._cells.seen(view.depth_m, view.T_world_camera, self._camera)
+            rows = self._cells.seen(view.depth_m, view.T_world_camera, camera)
             seen = self.gaussians.select(rows)
-        _, gradients = self._take.gradients(seen, self._camera, image, closing=looked_at.closing)
+        _, gradients = self._take.gradients(seen, camera, image, closing=looked_at.closing)
         limits = ScaleLimits(self._floor)
         step_in_place(
             self.gaussians, self._adam, gradients, rates=rates, limits=limits, rows=rows, chosen=self._trained

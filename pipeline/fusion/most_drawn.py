@@ -47,7 +47,7 @@ def most_drawn(
         pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
         context: the robot's own camera and settings.
         robot: its name.
-        views: own keyframes, and what peers' maps show; only poses and masks are used.
+        views: own keyframes, and what peers' maps show; only poses, cameras and masks are used.
     Returns:
         In the order of the fused map, then of the peers; ids of what comes in follow the largest of the fused map.
     """
@@ -96,7 +96,7 @@ def _drawn(gaussians: Gaussians, views: Sequence[PosedRgbd], context: MapContext
     for view in views:
         rasterizer.forward(
             gaussians,
-            context.camera,
+            view.camera or context.camera,
             se3.inverse(view.T_world_camera),
             mask=view.mask,
             depth_kind=context.depth_kind,

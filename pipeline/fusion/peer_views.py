@@ -8,6 +8,7 @@ saw from different sides, which neither robot's own images contain.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.kernels import Rasterizer
@@ -37,19 +39,20 @@ def peer_views(
     context: MapContext,
     *,
     depth_kinds: Mapping[str, DepthKind],
+    cameras: Mapping[str, PinholeCamera],
     colors: Mapping[str, ColorMap],
     keyframes: int = 0,
 ) -> Sequence[PosedRgbd]:
-    """Color and depth of every peer's map at its keyframes and half way between them, as the own camera sees.
+    """Color and depth of every peer's map at its keyframes and half way between them, as its camera sees.
 
     What a peer's map does not cover is masked, and what `peer_pixels` leaves out.
 
     Args:
         evidence: of the peers, by name, in the world frame, each in its own colors.
         T_world_keyframe: by name, [k, 4, 4] by anchor.
-        context: the robot's own camera and settings; `config.finetune.peer_views` of all views are taken,
-            evenly spread.
+        context: settings; `config.finetune.peer_views` of all views are taken, evenly spread.
         depth_kinds: as the maps were made, by name.
+        cameras: that took the keyframes, by name.
         colors: from every peer's colors to the own.
         keyframes: of the robot: a longer log has more views.
     """
@@ -58,7 +61,9 @@ def peer_views(
     config = context.config.finetune
     count = min(config.at_most(config.peer_views, keyframes), len(poses))
     chosen = [poses[k] for k in evenly_spaced(len(poses), count)]
-    return ShelvedList(_views(evidence, chosen, context, depth_kinds=depth_kinds, colors=colors))
+    return ShelvedList(
+        _views(evidence, chosen, context, depth_kinds=depth_kinds, cameras=cameras, colors=colors)
+    )
 
 
 def _views(
@@ -67,6 +72,7 @@ def _views(
     context: MapContext,
     *,
     depth_kinds: Mapping[str, DepthKind],
+    cameras: Mapping[str, PinholeCamera],
     colors: Mapping[str, ColorMap],
 ) -> Iterator[PosedRgbd]:
     rasterizer, drawn = Rasterizer(threads=context.threads), ""
@@ -77,24 +83,37 @@ def _views(
             gaussians = gaussians_of(peer.ids, peer.anchors, colors[name].parameters(peer))
             if kind not in ("covered", "random"):
                 sigma_m, _ = sigma_along(peer.position_information(), gaussians.normals())
-        T_camera_world = se3.inverse(T_world_camera)
-        render = rasterizer.forward(gaussians, context.camera, T_camera_world, depth_kind=depth_kinds[name])
+        T_camera_world, camera = se3.inverse(T_world_camera), cameras[name]
+        render = rasterizer.forward(gaussians, camera, T_camera_world, depth_kind=depth_kinds[name])
         seen = render.alpha >= COVERED
         if kind == "random":
             stream = random_streams.generator(context.seed, "fusion.peer-pixels", view=number)
             seen &= stream.random(seen.shape) < 0.5
         elif kind != "covered":
-            stated = _relative_sigma(gaussians, sigma_m, context, T_camera_world, depth=depth_kinds[name])
+            stated = _relative_sigma(
+                gaussians,
+                sigma_m,
+                camera,
+                T_camera_world,
+                threads=context.threads,
+                depth=depth_kinds[name],
+            )
             middle = np.median(stated[seen]) if seen.any() else 0.0
             seen &= stated <= middle if kind == "certain" else stated > middle
         share = np.where(seen, render.alpha, np.float32(1))
         color = np.rint(np.clip(render.color / share[..., None], 0, 1) * 255).astype(np.uint8)
         depth_m = np.where(seen, render.depth / share, np.float32(0))
-        yield PosedRgbd(color, depth_m, T_world_camera, seen)
+        yield PosedRgbd(color, depth_m, T_world_camera, seen, camera=camera)
 
 
 def _relative_sigma(
-    gaussians: Gaussians, sigma_m: Array, context: MapContext, T_camera_world: Array, *, depth: DepthKind
+    gaussians: Gaussians,
+    sigma_m: Array,
+    camera: PinholeCamera,
+    T_camera_world: Array,
+    *,
+    threads: SupportsIndex,
+    depth: DepthKind,
 ) -> NDArray[np.float32]:
     """Stated deviation of what a pixel blends, over its depth [h, w]; infinite where nothing is stated.
 
@@ -103,9 +122,9 @@ def _relative_sigma(
     blended = blended_values(
         gaussians,
         sigma_m,
-        context.camera,
+        camera,
         T_camera_world,
-        rasterizer=Rasterizer(threads=context.threads),
+        rasterizer=Rasterizer(threads=threads),
         depth_kind=depth,
     )
     depth_m = blended.render.depth / np.maximum(blended.render.alpha, np.float32(1e-6))

@@ -222,6 +222,7 @@ def _finetuned(
             poses,
             context,
             depth_kinds=result.depth_of,
+            cameras=result.camera_of,
             colors=fused.colors,
             keyframes=own.keyframes,
         )
@@ -239,6 +240,7 @@ def _finetuned(
                 factor=context.config.finer,
                 depth_images=_depth_images(own),
                 depth_kinds=result.depth_of,
+                cameras=result.camera_of,
             )
     trained = None if shown else fused.source == fused.robots.index(own.robot)
     refined = finetune_map(

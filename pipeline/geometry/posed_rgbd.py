@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure, unit_color
 
 
@@ -23,6 +24,7 @@ class PosedRgbd:
         exposure: of the image; None: as the map.
         T_camera_moment: [k, 4, 4], k odd: where the camera is while its shutter is open, seen from the middle; None: it
             stands still.
+        camera: that took it; None: the one at hand.
     """
 
     color: NDArray[np.uint8]
@@ -32,6 +34,7 @@ class PosedRgbd:
     depth_sigma_m: NDArray[np.float32] | None = None
     exposure: Exposure | None = None
     T_camera_moment: NDArray[np.float64] | None = None
+    camera: PinholeCamera | None = None
 
     @property
     def unit_color(self) -> NDArray[np.float32]:

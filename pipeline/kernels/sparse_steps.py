@@ -9,6 +9,7 @@ from several places they take several times as long.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,16 +70,18 @@ class SparseSteps:
         self._config = config
         self._closing_until = round(config.closing_until * steps)
         self._moving_from = config.moving_from * steps
-        self._boards = checkerboards(camera.height, camera.width)
+        self._camera = camera
 
-    def at(self, step: int, visit: int) -> LookedAt:
+    def at(self, step: int, visit: int, camera: PinholeCamera | None = None) -> LookedAt:
         """What a step looks at.
 
         Args:
             step: from 0.
             visit: number that differs by one from one look at a view to the next, which sees the other half.
+            camera: of the view; None: that of the views.
         """
-        board = self._boards[visit % 2]
+        seen = camera or self._camera
+        board = checkerboards(seen.height, seen.width)[visit % 2]
         return LookedAt(
             pixels=board if self._config.checkerboard else None,
             closing=self._config.closing if step < self._closing_until else 0.0,
@@ -86,6 +89,7 @@ class SparseSteps:
         )
 
 
+@lru_cache(maxsize=16)
 def checkerboards(height: int, width: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """The black and the white blocks of an image, bool [height, width] both.
 
@@ -95,4 +99,7 @@ def checkerboards(height: int, width: int) -> tuple[NDArray[np.bool_], NDArray[n
     """
     row, column = np.arange(height) // BLOCK_PX, np.arange(width) // BLOCK_PX
     black = (row[:, None] + column) % 2 == 0
-    return black, ~black
+    boards = black, ~black
+    for board in boards:
+        board.setflags(write=False)
+    return boards

@@ -112,6 +112,7 @@ class SessionResult:
         own_evidence: as it was sent, sorted by id.
         evidence: of the other members whose poses arrived, by name, as far as it arrived.
         depth_of: of a Gaussian at a pixel, as their maps were made, by name.
+        camera_of: that took their keyframes, by name.
         arrived: share of their evidence that is here, by name.
         pairs: ids of matched Gaussians, int64 [n, 2], by (lower, higher) name.
         closures: every candidate that this robot decided on.
@@ -129,6 +130,7 @@ class SessionResult:
     own_evidence: Evidence
     evidence: dict[str, Evidence]
     depth_of: dict[str, DepthKind]
+    camera_of: dict[str, PinholeCamera]
     arrived: dict[str, float]
     pairs: dict[tuple[str, str], NDArray[np.int64]]
     closures: tuple[LoopClosureRecord, ...]

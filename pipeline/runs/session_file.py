@@ -16,10 +16,11 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, new_file
 from duagc.pipeline.base.shelf import LARGE_BYTES, SHELF
 from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
 
 NAME = "session.npz"
-SCHEMA = 2
+SCHEMA = 3
 _DAMAGE = (  # what reading a damaged file raises; RuntimeError: a flag or a method that zipfile does not know
     zipfile.BadZipFile,
     zlib.error,
@@ -50,6 +51,7 @@ def write_session_result(path: Path, result: SessionResult) -> None:
         "own_evidence": _plain_evidence(result.own_evidence, arrays),
         "evidence": {name: _plain_evidence(e, arrays) for name, e in result.evidence.items()},
         "depth_of": result.depth_of,
+        "camera_of": {name: asdict(camera) for name, camera in result.camera_of.items()},
         "arrived": result.arrived,
         "pairs": [[lower, higher, arrays.add(ids)] for (lower, higher), ids in result.pairs.items()],
         "closures": [_plain_closure(closure, arrays) for closure in result.closures],
@@ -155,6 +157,7 @@ def _result(plain: dict[str, Any], array: _Reader) -> SessionResult:
         own_evidence=_evidence(plain["own_evidence"], array),
         evidence={name: _evidence(e, array) for name, e in plain["evidence"].items()},
         depth_of=plain["depth_of"],
+        camera_of={name: PinholeCamera(**camera) for name, camera in plain["camera_of"].items()},
         arrived=plain["arrived"],
         pairs={(lower, higher): array(ids) for lower, higher, ids in plain["pairs"]},
         closures=tuple(_closure(closure, array) for closure in plain["closures"]),

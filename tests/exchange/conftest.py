@@ -138,7 +138,8 @@ def team(make_robot: MakeRobot) -> Team:
     """Three robots; the map of the last was made with another depth."""
     robots = {name: make_robot(name, 0.6 * i, keyframes=4) for i, name in enumerate(NAMES)}
     data, T_true = robots["charlie"]
-    return robots | {"charlie": (replace(data, depth="ray_plane"), T_true)}
+    camera = replace(data.camera, cx=data.camera.cx + 0.01)
+    return robots | {"charlie": (replace(data, depth="ray_plane", camera=camera), T_true)}
 
 
 @pytest.fixture(scope="session")

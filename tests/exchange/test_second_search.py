@@ -25,8 +25,8 @@ CAMERA = PinholeCamera(160, 120, 100.0, 100.0, 79.5, 59.5)
 WALL = np.full((30, 40), 2.0, dtype=np.float32)  # every fourth pixel of a wall at 2 m
 
 
-def shared(*motion: float) -> float:
-    return float(shared_view(WALL, CAMERA, se3.exp(np.array(motion))[None])[0])
+def shared(*motion: float, peer_camera: PinholeCamera = CAMERA) -> float:
+    return float(shared_view(WALL, CAMERA, se3.exp(np.array(motion))[None], peer_camera)[0])
 
 
 def test_views_share_what_both_see_from_similar_directions() -> None:
@@ -36,7 +36,20 @@ def test_views_share_what_both_see_from_similar_directions() -> None:
     assert shared(0, 0, 0.8, 0, 0, 0) > 0.9  # it sees a third of the points, which fill its image
     assert shared(0, 0, 0, 0, 2.0, 0) == 0.0
     assert shared(2.4, 0, 0.3, 0, -1.0, 0) < 0.25  # in its image, but looked at from the side
-    assert float(shared_view(0 * WALL, CAMERA, np.eye(4)[None])[0]) == 0.0
+    assert float(shared_view(0 * WALL, CAMERA, np.eye(4)[None], CAMERA)[0]) == 0.0
+
+
+def test_views_of_other_cameras_share_what_these_see() -> None:
+    wide, narrow = (
+        replace(CAMERA, fx=40.0, fy=40.0),
+        replace(CAMERA, width=640, height=480, fx=1000.0, fy=1000.0),
+    )
+    narrow = replace(narrow, cx=319.5, cy=239.5)
+    assert shared(1.6, 0, 0, 0, 0, 0, peer_camera=wide) == 1.0  # it sees 8 m of the wall
+    assert shared(0, 0, 0, 0, 0, 0, peer_camera=narrow) == 1.0  # what it sees is seen by the own camera too
+    assert shared(1.4, 0, 0, 0, 0, 0, peer_camera=narrow) == pytest.approx(0.66, abs=0.1)
+    assert shared(0, 0, 0, 0, 1.05, 0, peer_camera=narrow) == 0.0  # next to what the own camera sees
+    assert shared(0, 0, 0, 0, 1.05, 0) > 0.1
 
 
 def test_overlaps_are_predicted_along_both_paths_by_the_nearest_closure() -> None:
@@ -46,7 +59,7 @@ def test_overlaps_are_predicted_along_both_paths_by_the_nearest_closure() -> Non
     drift = np.stack([np.arange(n) * 1e-4] * 2, axis=1)
     own, peer = KeyframePoses(path, drift), KeyframePoses(path.copy(), drift)
     true, false = LoopClosure(5, 5, np.eye(4), np.eye(6)), LoopClosure(30, 5, np.eye(4), np.eye(6))
-    found = overlaps([true, false], [WALL] * n, CAMERA, own=own, peer=peer)
+    found = overlaps([true, false], [WALL] * n, CAMERA, CAMERA, own=own, peer=peer)
     assert max(abs(j - 5) for _, j in found) == ALONG_PATH
     assert found[7, 7] == 1.0
     assert found[32, 7] == 1.0  # nearer to the false one
@@ -86,7 +99,7 @@ def search(robots: list[Any], min_score: int, blind: bool = False) -> tuple[Veri
     alpha, bravo = (KeyframeDatabase(data, config) for data in robots)
     verifier, provider = Verifier(alpha, "bravo", 0), Provider(bravo, "alpha", 0)
     if blind:
-        alpha.overlaps = lambda near, peer: {}  # type: ignore[method-assign]
+        alpha.overlaps = lambda near, peer, camera: {}  # type: ignore[method-assign]
     queue: list[tuple[Any, Kind, bytes]] = []
     provider.begin(lambda kind, payload: queue.append((verifier, kind, payload)))
     while queue:

@@ -39,12 +39,13 @@ def lossy_chain(
 
 
 def test_robots_know_how_the_maps_of_others_were_made(
-    lossy_chain: tuple[dict[str, SessionResult], Path, ExchangeConfig],
+    lossy_chain: tuple[dict[str, SessionResult], Path, ExchangeConfig], team: Team
 ) -> None:
     """Of alpha's and charlie's, who are not linked, by what bravo hands on."""
     kinds = {"alpha": "blended", "bravo": "blended", "charlie": "ray_plane"}
     for name, result in lossy_chain[0].items():
         assert result.depth_of == {other: kind for other, kind in kinds.items() if other != name}
+        assert result.camera_of == {other: team[other][0].camera for other in kinds if other != name}
 
 
 def test_a_chain_agrees_though_packets_are_lost(lossy_chain: Any, team: Team) -> None:

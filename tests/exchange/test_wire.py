@@ -3,6 +3,7 @@
 import contextlib
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from duagc.pipeline.consensus.admm_edge import PosePacket, SharedKeyframes
-from duagc.pipeline.exchange.wire import evidence_wire, loop_closing_wire, state_wire
+from duagc.pipeline.exchange.wire import anchors_wire, evidence_wire, loop_closing_wire, state_wire
+from duagc.pipeline.exchange.wire.camera_wire import camera_bytes, read_camera
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.network.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
 from duagc.pipeline.posegraph.cycle_consistency import Proposal
 from duagc.pipeline.registration import Reference, ReferenceLevel
@@ -23,6 +26,7 @@ from duagc.pipeline.splat.information import pack_symmetric, unpack_symmetric
 
 RNG = np.random.default_rng(5)
 TEAM = 4
+CAMERA = PinholeCamera(640, 480, 525.25, 525.0, 319.5, 239.5)
 
 
 @pytest.fixture(autouse=True)
@@ -90,6 +94,7 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
                 [RNG.integers(0, 256, (n, 128)).astype(np.uint8) for n in (3, 0, 2)],
                 poses(3),
                 np.array([[0, 0], [1, 1], [1, 3.0]]),
+                CAMERA,
             )
         ),
         loop_closing_wire.read_descriptors,
@@ -121,8 +126,8 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda d: state_wire.read_relative_frames(d, TEAM),
     ),
     "anchors": (
-        state_wire.write_anchors(state_wire.Anchors(2, poses(4), poses(1)[0])),
-        lambda d: state_wire.read_anchors(d, TEAM),
+        anchors_wire.write_anchors(anchors_wire.Anchors(2, poses(4), poses(1)[0], CAMERA)),
+        lambda d: anchors_wire.read_anchors(d, TEAM),
     ),
     "voxels": (
         state_wire.write_voxels(3, np.cumsum(RNG.integers(1, 1 << 40, 50))),
@@ -170,12 +175,24 @@ def test_a_wrong_length_is_refused(name: str, change: int) -> None:
 
 
 def test_final_poses_and_voxels_come_back_bit_for_bit() -> None:
-    anchors = state_wire.Anchors(2, poses(4), poses(1)[0])
-    back = state_wire.read_anchors(state_wire.write_anchors(anchors), TEAM)
+    anchors = anchors_wire.Anchors(2, poses(4), poses(1)[0], CAMERA)
+    back = anchors_wire.read_anchors(anchors_wire.write_anchors(anchors), TEAM)
     assert np.array_equal(back.T_common_keyframe, anchors.T_common_keyframe)
     assert np.array_equal(back.T_map_first, anchors.T_map_first)
+    assert back.camera == CAMERA
     for keys in (np.zeros(0, np.int64), np.array([0, 1, 127, 128, (1 << 60) - 1])):
         assert np.array_equal(state_wire.read_voxels(state_wire.write_voxels(1, keys), TEAM)[1], keys)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("width", 0), ("height", 16_385), ("fx", 0.0), ("fx", -5.0), ("fy", np.inf), ("fy", 1e7), ("cx", np.nan),
+     ("cy", -1e5)],
+)  # fmt: skip
+def test_an_impossible_camera_is_refused(field: str, value: float) -> None:
+    data = camera_bytes(replace(CAMERA, **{field: value}))
+    with pytest.raises(MalformedError, match="impossible camera"):
+        read_camera(state_wire.Reader(data, "anchors"))
 
 
 def test_a_sample_comes_back_within_its_quantization() -> None:

@@ -1,5 +1,7 @@
 """Whose Gaussians draw a surface in the final map: a wall 2 m ahead, that robots saw from different distances."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,7 +42,7 @@ def known(name, gaussians, information):
     )
 
 
-def final_map(poses, finer=1.5, walls=None, information=1.0):
+def final_map(poses, finer=1.5, walls=None, information=1.0, camera=CAMERA):
     """Of alpha's final map: the places in alpha's view that its own Gaussians draw, and those that each peer's do."""
     maps = {name: wall() for name in poses} | (walls or {})
     evidence = {n: known(n, g, information * (k + 1)) for k, (n, g) in enumerate(maps.items())}
@@ -63,6 +65,7 @@ def final_map(poses, finer=1.5, walls=None, information=1.0):
         factor=finer,
         depth_images=measured,
         depth_kinds=dict.fromkeys(poses, "blended"),
+        cameras=dict.fromkeys(poses, camera),
     )
     gaussians = found.gaussians
     assert len(np.unique(gaussians.ids)) == len(gaussians)
@@ -89,11 +92,11 @@ def places(means):
     return set(found)
 
 
-def seen_from(pose):
+def seen_from(pose, camera=CAMERA):
     """Which Gaussians of the wall a keyframe sees: their centers fall on one of its pixels."""
     x, y, z = (wall().means - pose[0, :3, 3]).T
-    u, v = np.rint(CAMERA.fx * x / z + CAMERA.cx), np.rint(CAMERA.fy * y / z + CAMERA.cy)
-    return (u >= 0) & (u < CAMERA.width) & (v >= 0) & (v < CAMERA.height)
+    u, v = np.rint(camera.fx * x / z + camera.cx), np.rint(camera.fy * y / z + camera.cy)
+    return (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
 
 
 IN_VIEW = set(np.flatnonzero(seen_from(at(0.0))))
@@ -109,6 +112,19 @@ def test_a_peer_that_stood_nearer_draws_what_it_saw():
 @pytest.mark.parametrize(("z_m", "finer"), [(1.0, 2.5), (0.0, 1.0), (-1.0, 1.0)])
 def test_where_no_peer_saw_finer_the_own_map_stays(z_m, finer):
     assert final_map({"alpha": at(0.0), "bravo": at(z_m)}, finer) == [IN_VIEW, set()]
+
+
+def test_a_peer_with_a_longer_lens_draws_what_it_saw_from_as_far():
+    poses = {"alpha": at(0.0), "bravo": at(0.0)}
+    longer = replace(CAMERA, fx=2 * CAMERA.fx, fy=2 * CAMERA.fy)
+    seen = set(np.flatnonzero(seen_from(poses["bravo"], longer)))
+    assert final_map(poses, camera=longer) == [IN_VIEW - seen, seen]
+    assert 100 < len(seen) < len(IN_VIEW) - 100
+
+
+def test_a_peer_that_stood_nearer_with_a_shorter_lens_saw_no_more():
+    poses = {"alpha": at(0.0), "bravo": at(1.0)}
+    assert final_map(poses, camera=replace(CAMERA, fx=CAMERA.fx / 2, fy=CAMERA.fy / 2)) == [IN_VIEW, set()]
 
 
 def test_what_a_peer_has_not_got_stays():

@@ -15,6 +15,7 @@ from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.finetune import finetune_map, num_steps
 from duagc.pipeline.fusion.peer_views import peer_views
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
@@ -160,12 +161,14 @@ def seen_by_zulu(
     depth_kind: DepthKind = "blended",
     threads: int = 1,
     pixels: str = "covered",
+    camera: PinholeCamera = CAMERA,
 ) -> list[PosedRgbd]:
     return peer_views(
         {"zulu": evidence.in_world(T_world_keyframe)},
         {"zulu": T_world_keyframe},
         context(FinetuneConfig(peer_views=most, peer_pixels=pixels), threads=threads),
         depth_kinds={"zulu": depth_kind},
+        cameras={"zulu": camera},
         colors=ALIKE,
     )
 
@@ -214,7 +217,22 @@ def test_a_neighbors_map_shows_what_it_would_from_where_the_neighbor_stood() -> 
         all_of_them[k].T_world_camera.tolist() for k in (1, 3)
     ]
     assert np.array_equal(some[0].color, all_of_them[1].color)
-    assert not peer_views({}, {}, context(FinetuneConfig()), depth_kinds={}, colors={})
+    assert not peer_views({}, {}, context(FinetuneConfig()), depth_kinds={}, cameras={}, colors={})
+
+
+def test_a_neighbors_map_is_drawn_as_its_camera_sees() -> None:
+    true, poses = wall(), np.array(POSES[:1])
+    evidence = Evidence.from_map("zulu", true.replace(anchors=np.zeros(400, np.int32)), None, poses)
+    camera = PinholeCamera(96, 40, 80.0, 82.0, 47.0, 20.0)
+    (view,) = seen_by_zulu(evidence, poses, 1, camera=camera)
+    assert view.camera == camera
+    render = Rasterizer().forward(true, camera, se3.inverse(poses[0]))
+    assert view.mask is not None
+    assert np.array_equal(view.mask, render.alpha >= 0.9)
+    sure = view.mask
+    np.testing.assert_allclose(
+        view.color[sure], 255 * render.color[sure] / render.alpha[sure][:, None], atol=1
+    )
 
 
 def test_of_a_neighbors_views_the_half_of_which_its_information_is_better_can_be_taken() -> None:
@@ -251,6 +269,24 @@ def test_neighbors_views_teach_what_own_ones_do_not_see(spoiled: tuple[Gaussians
     assert score(together, views) > score(alone, views) + 3
     same = finetune_map(gaussians, own, context(config, threads=2), peer_views=views[1::2])
     assert np.array_equal(together.means, same.means)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_views_of_another_camera_teach_as_well(
+    spoiled: tuple[Gaussians, list[PosedRgbd]], scale: float
+) -> None:
+    gaussians, views = spoiled
+    camera = CAMERA.scaled(round(64 * scale), round(48 * scale))
+    theirs = []
+    for view in views[1::2]:
+        render = Rasterizer().forward(wall(), camera, se3.inverse(view.T_world_camera))
+        depth_m = np.where(render.alpha > 0.9, render.depth / np.maximum(render.alpha, 1e-6), 0)
+        color = np.clip(np.rint(255 * render.color), 0, 255).astype(np.uint8)
+        theirs.append(PosedRgbd(color, depth_m.astype(np.float32), view.T_world_camera, camera=camera))
+    nothing = [replace(v, mask=np.zeros((48, 64), bool)) for v in views[::2]]
+    settings = context(FinetuneConfig(steps_per_view=30, rate=0.3, peer_share=1.0))
+    taught = finetune_map(gaussians, nothing, settings, peer_views=theirs)
+    assert score(taught, views) > score(gaussians, views) + 3
 
 
 def test_steps_are_shared_out() -> None:

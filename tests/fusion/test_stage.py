@@ -60,6 +60,10 @@ class Result:
         return dict.fromkeys(self.evidence, "blended")
 
     @property
+    def camera_of(self) -> dict[str, PinholeCamera]:
+        return dict.fromkeys(self.evidence, CAMERA)
+
+    @property
     def arrived(self) -> dict[str, float]:
         return dict.fromkeys(self.evidence, 1.0)
 

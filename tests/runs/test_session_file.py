@@ -9,6 +9,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
 from duagc.pipeline.runs.session_file import read_session_result, write_session_result
 
@@ -45,6 +46,7 @@ def result() -> SessionResult:
         own_evidence=evidence("bravo", 5, rounded=False),
         evidence={"alpha": evidence("alpha", 400, rounded=True)},
         depth_of={"alpha": "ray_plane"},
+        camera_of={"alpha": PinholeCamera(640, 480, 525.25, 525.0, 319.5, 239.5)},
         arrived={"alpha": 0.3},
         pairs={("alpha", "bravo"): np.array([[1, 2], [3, 4]])},
         closures=(closure, replace(closure, T_own_peer=None, weight=None)),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
+from duagc.pipeline.exchange.wire.camera_wire import camera_bytes, read_camera
 from duagc.pipeline.exchange.wire.state_wire import (
     MAX_KEYFRAMES,
     Reader,
@@ -17,6 +18,7 @@ from duagc.pipeline.exchange.wire.state_wire import (
     motion_bytes,
     pose_bytes,
 )
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.registration import Reference, ReferenceLevel
 from duagc.pipeline.registration.features import DIMENSIONS, Descriptors, Features
@@ -40,11 +42,13 @@ class DescriptorSet:
         descriptors: one array per keyframe.
         T_first_keyframe: [n, 4, 4], as seen from its first keyframe.
         drift: [n, 2], accumulated variance of its odometry from keyframe 0 (m^2, rad^2).
+        camera: that took its keyframes.
     """
 
     descriptors: list[Descriptors]
     T_first_keyframe: Array
     drift: Array
+    camera: PinholeCamera
 
 
 _COUNT = struct.Struct("<I")
@@ -55,6 +59,7 @@ def write_descriptors(own: DescriptorSet) -> bytes:
     return b"".join(
         [
             _COUNT.pack(len(own.descriptors)),
+            camera_bytes(own.camera),
             pose_bytes(own.T_first_keyframe),
             array_bytes(own.drift, "float64"),
             array_bytes([len(d) for d in own.descriptors], "uint16"),
@@ -66,12 +71,12 @@ def write_descriptors(own: DescriptorSet) -> bytes:
 def read_descriptors(data: bytes) -> DescriptorSet:
     """From DESCRIPTORS."""
     reader = Reader(data, "descriptors")
-    n = _keyframe_count(reader)
+    n, camera = _keyframe_count(reader), read_camera(reader)
     T, drift = reader.poses(n), reader.array("float64", (n, 2))
     if n and (drift.min() < 0 or drift.max() > 1e12 or np.diff(drift, axis=0).min(initial=0.0) < 0):
         raise MalformedError("descriptors: the drift of the odometry must grow from zero")
     counts = reader.array("uint16", (n,)).tolist()
-    own = DescriptorSet([reader.array("uint8", (count, DIMENSIONS)) for count in counts], T, drift)
+    own = DescriptorSet([reader.array("uint8", (count, DIMENSIONS)) for count in counts], T, drift, camera)
     reader.done()
     return own
 

@@ -1,8 +1,8 @@
-"""Bytes of messages, and their strict reading: state, relative frames, final poses, space, matches. Little-endian.
+"""Bytes of messages, and their strict reading: state, relative frames, space, matches. Little-endian.
 
 Readers trust nothing: every count is checked against the bytes that are there, every index against its limit, every
-number that enters the mathematics must be finite. What does not fit raises MalformedError with the reason. Others:
-`loop_closing_wire`, `poses_wire`, `tree_wire`, `evidence_wire`.
+number that enters the mathematics must be finite. What does not fit raises MalformedError with the reason. The other
+modules here are as strict.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ def read_labeled(data: bytes, team: int) -> tuple[int, bytes]:
     return _read_pairs(reader, team), data[reader.position :]
 
 
-# --- relative frames and final poses
+# --- relative frames
 
 
 _FRAME = struct.Struct("<HHB")
@@ -274,42 +274,10 @@ def read_relative_frames(data: bytes, team: int) -> RelativeFrames:
     return RelativeFrames(lower, higher, tuple(proposals))
 
 
-@dataclass(frozen=True)
-class Anchors:
-    """Agreed poses of one robot.
-
-    Attributes:
-        owner: index of the robot.
-        T_common_keyframe: [n, 4, 4], its keyframes in the common frame of the consensus.
-        T_map_first: [4, 4], its first keyframe in its own map.
-    """
-
-    owner: int
-    T_common_keyframe: Array
-    T_map_first: Array
+# --- space seen, matched Gaussians
 
 
 _OWNER = struct.Struct("<HI")
-
-
-def write_anchors(anchors: Anchors) -> bytes:
-    """Bytes of ANCHORS."""
-    head = _OWNER.pack(anchors.owner, len(anchors.T_common_keyframe))
-    return head + pose_bytes(anchors.T_map_first) + pose_bytes(anchors.T_common_keyframe)
-
-
-def read_anchors(data: bytes, team: int) -> Anchors:
-    """From ANCHORS."""
-    reader = Reader(data, "anchors")
-    owner, n = reader.fields(_OWNER)
-    if owner >= team or not 1 <= n <= MAX_KEYFRAMES:
-        raise MalformedError("anchors: names a robot outside the team, or no keyframe")
-    first, T = reader.poses(1)[0], reader.poses(n)
-    reader.done()
-    return Anchors(owner, T, first)
-
-
-# --- space seen, matched Gaussians
 
 
 def write_voxels(owner: int, keys: NDArray[np.int64]) -> bytes:

@@ -1,0 +1,35 @@
+"""Bytes of a camera: others need it to know what a keyframe sees, and how finely. Strict as `state_wire`."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+from duagc.pipeline.exchange.wire.state_wire import Reader
+from duagc.pipeline.geometry.camera import MAX_SIDE_PX, PinholeCamera
+from duagc.pipeline.network.packets import MalformedError
+
+_CAMERA = struct.Struct("<HHdddd")
+MAX_FOCAL_PX = 1e6
+"""Of any camera: a telescope."""
+
+
+def camera_bytes(camera: PinholeCamera) -> bytes:
+    """Bytes of a camera: 36."""
+    return _CAMERA.pack(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def read_camera(reader: Reader) -> PinholeCamera:
+    """The camera that comes next.
+
+    Raises:
+        MalformedError: no camera is like that.
+    """
+    width, height, fx, fy, cx, cy = reader.fields(_CAMERA)
+    sides = min(width, height) >= 1 and max(width, height) <= MAX_SIDE_PX
+    focal = all(math.isfinite(f) and 0 < f <= MAX_FOCAL_PX for f in (fx, fy))
+    # a principal point outside the image is that of a part of a larger one
+    center = all(math.isfinite(c) and abs(c) <= MAX_SIDE_PX for c in (cx, cy))
+    if not (sides and focal and center):
+        raise MalformedError(f"{reader.what}: an impossible camera")
+    return PinholeCamera(width, height, fx, fy, cx, cy)
