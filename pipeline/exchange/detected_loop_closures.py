@@ -41,7 +41,7 @@ from duagc.pipeline.exchange.loop_closing import (
 )
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
 from duagc.pipeline.exchange.rectified_search import RectifiedSearch, most_alike
-from duagc.pipeline.exchange.verification import Verdict, Verified, verify
+from duagc.pipeline.exchange.verification import Verdict, Verified, verify, within_view
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import (
     DescriptorSet,
@@ -143,6 +143,7 @@ class Verifier(LoopClosureProtocol):
         self.database, self.config, self.seed = database, database.config, seed
         self.planner: Planner | None = None
         self.peer_camera: PinholeCamera | None = None
+        self.limits = self.config.verification
         self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbor
         # of its keyframes, until decided: compact descriptors, those that resemble no own one, samples that arrived
         self.compact: list[Descriptors] = []
@@ -179,6 +180,7 @@ class Verifier(LoopClosureProtocol):
         """Score all pairs of keyframes and request the samples of the most promising."""
         self.peer_keyframes = KeyframePoses(received.T_first_keyframe, received.drift)
         self.peer_camera = received.camera
+        self.limits = within_view(self.config.verification, self.database.data.camera, received.camera)
         self.compact = received.descriptors
         c = self.config.places
         candidates, self.unlike = place_recognition.scored(
@@ -257,7 +259,7 @@ class Verifier(LoopClosureProtocol):
         for own, peer_keyframe in most_alike(inliers, known, c.candidates_per_keyframe):
             candidate = Candidate(own, peer_keyframe, self._score(own, peer_keyframe))
             sample = self.samples[peer_keyframe]
-            check = partial(search.verify, candidate, database, sample, self.seed)
+            check = partial(search.verify, candidate, database, sample, config=self.limits, seed=self.seed)
             result = database.recall(f"{between}: {own} {peer_keyframe}", check)
             search.tried[candidate.ends] = Tried(candidate, result)
             self.planner.take(candidate, result.closure is not None)
@@ -301,7 +303,7 @@ class Verifier(LoopClosureProtocol):
             self.database.features[own],
             self.database.pyramid(own),
             sample,
-            config=self.config.verification,
+            config=self.limits,
             rng=rng,
         )
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.config.exchange import VerificationConfig
 from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase, digest_of
 from duagc.pipeline.exchange.loop_closing import Tried
 from duagc.pipeline.exchange.place_recognition import Candidate
@@ -70,7 +71,13 @@ class RectifiedSearch:
         return found
 
     def verify(
-        self, candidate: Candidate, database: KeyframeDatabase, sample: KeyframeSample, seed: int
+        self,
+        candidate: Candidate,
+        database: KeyframeDatabase,
+        sample: KeyframeSample,
+        *,
+        config: VerificationConfig,
+        seed: int,
     ) -> Verified:
         """Verify a pair of keyframes by features of both kinds.
 
@@ -78,6 +85,7 @@ class RectifiedSearch:
             candidate: the pair.
             database: own keyframes.
             sample: of the neighbor's keyframe.
+            config: limits of all tests.
             seed: of this run.
         """
         own = candidate.own_keyframe
@@ -88,7 +96,7 @@ class RectifiedSearch:
             ours[0],
             database.pyramid(own),
             sample,
-            config=database.config.verification,
+            config=config,
             rng=_stream(seed, ours, theirs),
             rectified=(ours[1], theirs[1]),
         )

@@ -15,8 +15,9 @@ from duagc.pipeline.config.exchange import VerificationConfig
 from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
-from duagc.pipeline.registration import Reference, RgbdPyramid, geometric_verification
+from duagc.pipeline.registration import RgbdPyramid, geometric_verification
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.geometric_verification import (
     Failure,
@@ -25,8 +26,6 @@ from duagc.pipeline.registration.geometric_verification import (
     VerificationView,
 )
 from duagc.pipeline.registration.gicp import register_points
-
-MOST_SAMPLES = (5.0, 95.0)  # percentiles: a few samples that are not true move nothing
 
 
 class Verdict(Enum):
@@ -66,6 +65,31 @@ class Verified:
     tentative: LoopClosure | None = None
 
 
+def within_view(
+    config: VerificationConfig, camera: PinholeCamera, peer_camera: PinholeCamera
+) -> VerificationConfig:
+    """The limits with overlaps of what the own camera can see at all of the neighbor's view.
+
+    Overlap is a share of the neighbor's samples, which fill its view. A camera whose view is narrower sees no more of
+    them than the ratio of the two, however well it looks at the same place.
+
+    Args:
+        config: limits for cameras that are alike.
+        camera: the robot's own.
+        peer_camera: the neighbor's.
+    """
+    share = min(1.0, _view(camera) / _view(peer_camera))
+    if share == 1.0:
+        return config
+    within = config.registration.model_copy(update={"min_overlap": share * config.registration.min_overlap})
+    return config.model_copy(update={"min_overlap": share * config.min_overlap, "registration": within})
+
+
+def _view(camera: PinholeCamera) -> float:
+    """Area of the image one unit in front of the camera."""
+    return camera.width * camera.height / (camera.fx * camera.fy)
+
+
 def verify(
     candidate: Candidate,
     own: Features,
@@ -85,14 +109,13 @@ def verify(
         own: all features of the own keyframe.
         own_pyramid: its images.
         sample: of the neighbor's keyframe, as it sent it.
-        config: limits of all tests.
+        config: limits of all tests (`within_view`).
         rng: the stream of this pair of keyframes.
         rectified: features of the surfaces of both views, the own ones first, as if the cameras faced them.
 
     Returns:
         The verdict, and the loop closure T_own_peer with its information if the verdict is KEPT.
     """
-    config = _within_view(config, own_pyramid, sample.reference)
     if config.method != "features":
         return _verified_by_gicp(candidate, own, own_pyramid, sample, config=config, rng=rng)
     faced, faced_by_peer = rectified or (None, None)
@@ -110,27 +133,6 @@ def verify(
     elif found.features.T_first_second is not None and found.features.accepted:
         tentative = LoopClosure(*candidate.ends, found.features.T_first_second, np.zeros((6, 6)))
     return Verified(verdict, found.features.matches, found.features.inliers, detail, closure, tentative)
-
-
-def _within_view(
-    config: VerificationConfig, pyramid: RgbdPyramid, reference: Reference
-) -> VerificationConfig:
-    """The limits with overlaps of what a camera can see at all, if its view is narrower than the neighbor's.
-
-    Overlap is a share of the neighbor's samples, which fill its view. What nine of ten of them span along either axis
-    is less than the view of a camera that is alike, so that nothing changes then.
-    """
-    camera, points = pyramid.levels[0].camera, reference.levels[0].points.astype(np.float64)
-    ahead = points[points[:, 2] > 0]
-    if not len(ahead):
-        return config
-    low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], MOST_SAMPLES, axis=0)
-    view = np.array([camera.width / camera.fx, camera.height / camera.fy])
-    share = min(1.0, float(np.prod(view) / max(np.prod(high - low), np.finfo(float).tiny)))
-    if share == 1.0:
-        return config
-    within = config.registration.model_copy(update={"min_overlap": share * config.registration.min_overlap})
-    return config.model_copy(update={"min_overlap": share * config.min_overlap, "registration": within})
 
 
 def _verified_by_gicp(

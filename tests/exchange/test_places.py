@@ -18,7 +18,7 @@ from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.exchange import place_recognition
 from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
-from duagc.pipeline.exchange.verification import Verdict, Verified, verify
+from duagc.pipeline.exchange.verification import Verdict, Verified, verify, within_view
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
 from duagc.pipeline.geometry import se3
@@ -124,6 +124,15 @@ def test_a_view_that_shows_little_of_the_other_is_enough(robots: dict) -> None:
     assert "low_overlap" in refused.detail
 
 
+def test_overlap_is_of_what_a_camera_can_see_at_all() -> None:
+    config, narrow = VerificationConfig(), replace(CAMERA, fx=2 * CAMERA.fx, fy=2.5 * CAMERA.fy)
+    assert within_view(config, CAMERA, CAMERA) is config
+    assert within_view(config, CAMERA, narrow) is config
+    within = within_view(config, narrow, CAMERA)
+    assert within.min_overlap == pytest.approx(config.min_overlap / 5)
+    assert within.registration.min_overlap == pytest.approx(config.registration.min_overlap / 5)
+
+
 @pytest.mark.parametrize("own_is_narrow", [True, False])
 def test_a_narrow_camera_and_a_wide_one_find_each_other(own_is_narrow: bool) -> None:
     """The narrow one sees a tenth of what the wide one sees, and all of that is in the wide one's view."""
@@ -138,7 +147,8 @@ def test_a_narrow_camera_and_a_wide_one_find_each_other(own_is_narrow: bool) -> 
     )
     sample = KeyframeSample(0, theirs, Reference.sample(other, 2000))
     rng = random_streams.generator(0, "test")
-    result = verify(Candidate(0, 0, 20), own, pyramid, sample, config=VerificationConfig(), rng=rng)
+    config = within_view(VerificationConfig(), *cameras)
+    result = verify(Candidate(0, 0, 20), own, pyramid, sample, config=config, rng=rng)
     assert result.closure is not None, (result.verdict, result.detail)
     moved_m, moved_rad = se3.distance(result.closure.T_own_peer, se3.inverse(T[0]) @ turned(T[0]))
     assert moved_m < 0.02
