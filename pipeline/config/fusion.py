@@ -93,6 +93,9 @@ class PeerValidationConfig(Config):
     max_contradicted: float = Field(default=0.2, ge=0.0, le=1.0)
     """Share of the Gaussians that own images judge, up to which a map that explains too little because of those that
     they contradict is judged without these."""
+    max_in_free_space: float = Field(default=0.3, ge=0.0, le=1.0)
+    """Share of the Gaussians where own depth images reach, up to which those that own depth images see through are
+    left out of a map that explains too little."""
     min_explained_by_rest: float = Field(default=0.5, ge=0.0, le=1.0)
     """Share of the variance that it must explain then."""
     passes: int = Field(default=2, ge=1)

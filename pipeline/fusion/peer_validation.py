@@ -10,7 +10,9 @@ no evidence. Colors are those that the own camera would show (`consensus.colors`
 A Gaussian is contradicted if its pixels are rendered worse than by one gray for everything: its error is above the
 variance of the own images. A peer as a whole is contradicted if its map does not explain some of the variance of the
 pixels that it was judged on, neither as it is nor, if they are few, without the Gaussians that are contradicted: where
-a camera measures no depth, honest maps hold Gaussians that are right in that camera's own views alone.
+a camera measures no depth, honest maps hold Gaussians that are right in that camera's own views alone. In front of all
+else they hide what is true; if need be a map is judged without all that stands in space that own depth images saw
+through.
 What no own keyframe saw cannot be judged.
 
 Matches are checked, too, because the lower-named robot of a pair decides on them: two Gaussians that are not near each
@@ -38,6 +40,7 @@ from duagc.pipeline.consensus.matching import Pairs, gaussian_distance, threshol
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
+from duagc.pipeline.geometry.projection import visible
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN, gaussians_of
@@ -303,7 +306,7 @@ class _PhotometricCheck:
         self.views, self.context, self.depth_kind, self.config = views, context, depth_kind, config
         self.rasterizer = Rasterizer(threads=context.threads)
         self.own, self.color_mse = _ColorStatistics(config.min_color_variance), 0.0
-        self._seen_px = 0  # that saw the whole map
+        self._seen_px = self._first_px = 0  # that saw the whole map
         self.num_contradicted = 0
 
     def trusted(self, own_px: int) -> bool:
@@ -321,18 +324,48 @@ class _PhotometricCheck:
     def contradicted(self, world: Evidence, gray: float) -> NDArray[np.bool_]:
         """Which Gaussians [n] own images contradict: error above `gray`, the variance of own colors."""
         gaussians = gaussians_of(world.ids, world.anchors, world.theta)
-        against, judged = np.zeros((2, len(world)), bool)
+        against = self._judged(gaussians, np.zeros(len(world), bool), gray)
+        self._seen_px = self._first_px
+        if self._explains:
+            return against
+        free, seen = self._in_free_space(world.theta[:, MEAN])
+        if free.any() and np.sum(free) <= self.config.max_in_free_space * np.sum(seen):
+            self.explained = max(self.explained, self.config.min_explained_by_rest)
+            against = self._judged(gaussians, free, gray)
+        return against
+
+    def _judged(self, gaussians: Gaussians, without: NDArray[np.bool_], gray: float) -> NDArray[np.bool_]:
+        """Which Gaussians [n] are contradicted, drawn without some, which are; own colors are counted anew.
+
+        If it explains too little because of few of them, it is judged by the rest.
+        """
+        against, judged = without.copy(), np.zeros_like(without)
         for turn in range(self.config.passes):
             rows = np.flatnonzero(~against)
             errors = self._errors(gaussians.select(rows), count=turn == 0)
+            if not turn:
+                self._first_px = self.own.pixels
             against[rows[errors > gray]] = True
             judged[rows[errors > 0]] = True
-        self._seen_px = self.own.pixels
-        false_share = np.sum(against) / max(np.sum(judged), 1)
+        false_share = int(np.sum(against & ~without)) / max(int(np.sum(judged)), 1)
         if not self._explains and false_share <= self.config.max_contradicted:  # what is not used may be why
             self._errors(gaussians.select(~against), count=True)
             self.explained = max(self.explained, self.config.min_explained_by_rest)
         return against
+
+    def _in_free_space(self, means_world: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which places [n, 3] most own depth images that see as far measured beyond; and which any of them saw."""
+        config, camera = self.context.config, self.context.camera
+        beyond, there = np.zeros((2, len(means_world)), np.int64)
+        for view in self.views:
+            at = se3.transform(se3.inverse(view.T_world_camera), means_world)
+            index, column, row = visible(camera, at)
+            z, measured_m = at[index, 2], view.usable_depth[row, column].astype(np.float64)
+            slack_m = config.explained_m + config.explained_relative * z
+            known = measured_m > 0
+            beyond[index] += known & (measured_m > z + slack_m)
+            there[index] += known & (np.abs(measured_m - z) <= slack_m)
+        return beyond > there, beyond + there > 0
 
     def _errors(self, gaussians: Gaussians, *, count: bool) -> Array:
         """Mean squared error of the pixels of each Gaussian [n], zero of too few; `count`: own colors there, anew."""

@@ -238,7 +238,7 @@ def test_without_neighbors_of_its_own_a_robot_believes_matches_of_two_peers(view
     assert len(validated.pairs["bravo", "charlie"]) > 0.9 * N
 
 
-@pytest.mark.parametrize(("veils", "trusted"), [(60, True), (150, False)])
+@pytest.mark.parametrize(("veils", "trusted"), [(60, True), (150, True), (400, False)])
 def test_what_is_contradicted_counts_once(views, veils, trusted):
     """Gaussians in free space that hide much of the map do not make the rest a lie, unless they are many."""
     rng = np.random.default_rng(1)
@@ -250,3 +250,20 @@ def test_what_is_contradicted_counts_once(views, veils, trusted):
     used = validated.uncontradicted["bravo"].ids if trusted else []
     assert len(used) > 0.8 * N or not trusted
     assert not trusted or check.color_mse < 0.5 * check.color_variance
+
+
+@pytest.mark.parametrize(("layers", "trusted"), [(2, True), (4, True), (20, False)])
+def test_layers_in_free_space_that_hide_all_else_are_left_out(views, layers, trusted):
+    """The map is judged by what stands where own depth images measured it, unless they are many."""
+    rng = np.random.default_rng(2)
+    x, y = (c.ravel() for c in np.meshgrid(np.linspace(-1.1, 1.1, 4), np.linspace(-0.8, 0.8, 3)))
+    veils = []
+    for z in np.linspace(0.5, 1.5, layers):
+        # as wide as its part of the view
+        places = zip(0.6 * z * x, 0.6 * z * y, strict=True)
+        veils += [((*place, z), 0.25 * z, tuple(rng.integers(0, 2, 3))) for place in places]
+    validated = validated_by_alpha(views, map_of("bravo", discs=veils))
+    (check,) = validated.checks
+    assert check.trusted == trusted
+    assert not trusted or np.mean(validated.contradicted["bravo"][N:]) > 0.7
+    assert not trusted or np.mean(validated.contradicted["bravo"][:N]) < 0.2
