@@ -78,6 +78,24 @@ class SeedingConfig(Config):
         return sides
 
 
+class FarDepthConfig(Config):
+    """Depth of what is beyond the range of the depth camera, by the color images of other keyframes: maps are seeded
+    there too. It is no measurement, and takes part in nothing else."""
+
+    keyframes: int = Field(default=4, ge=0)
+    """Most other keyframes that one is compared with; 0: no such depth."""
+    planes: int = Field(default=128, ge=2)
+    """Most depths that are compared."""
+    least_missing: float = Field(default=0.03, ge=0.0, le=1.0)
+    """Share of an image without depth from which on it is looked for."""
+    alike: float = Field(default=0.7, ge=0.0, le=1.0)
+    """Least correlation of what is the same surface."""
+    clearer: float = Field(default=0.05, ge=0.0, le=1.0)
+    """By which it exceeds the correlation at any other depth."""
+    filled_px: float = Field(default=8.0, ge=0.0)
+    """Pixels of a small image around what is found that get its depth."""
+
+
 class MappingConfig(Config):
     """How the map is grown and optimized."""
 
@@ -156,6 +174,7 @@ class MappingConfig(Config):
     single Gaussian."""
     loss: MapLossConfig = MapLossConfig()
     seeding: SeedingConfig = SeedingConfig()
+    far: FarDepthConfig = FarDepthConfig()
     min_opacity: float = 0.03
     """Gaussians below are pruned."""
     max_scale_m: float = Field(default=0.25, gt=0.0)

@@ -19,6 +19,7 @@ from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.frontend.far_depth import FarDepth
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.joint_training import JointTraining, JointView
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
@@ -81,6 +82,7 @@ class MapBuilder:
         self._free = FreeSpace(log.camera, config.moving)
         self._whole = GrowingMap(config.mapping, threads=threads)
         self._keyframes: Sequence[Keyframe] = ()
+        self._far = FarDepth(log.camera, config.mapping.far)
         self._sights: list[ViewExtent] = []
         self._tiles: list[list[int]] = []
         self._kept: Mapper | None = None  # the last tile that grew
@@ -137,16 +139,18 @@ class MapBuilder:
         self._keyframes = keyframes
         self._poses = {k.frame_index: k.T_map_camera for k in keyframes}
         for keyframe in keyframes:
-            depth_m = self.log.frame(keyframe.frame_index).usable_depth
+            frame = self.log.frame(keyframe.frame_index)
+            depth_m = frame.usable_depth
+            self._far.add(frame.color, depth_m, keyframe.T_map_camera)
             self._free.add(depth_m, keyframe.T_map_camera)
             self._sights.append(ViewExtent.of(depth_m, self.log.camera))
         centers = [
             se3.transform(k.T_map_camera, sight.center_camera[None])[0]
             for k, sight in zip(keyframes, self._sights, strict=True)
         ]
-        config, every = self.config.mapping, list(range(len(keyframes)))
-        whole = len(every) <= config.whole_keyframes
-        self._tiles = [every] if whole else make_tiles(np.array(centers), config.tile_keyframes)
+        config, every = self.config.mapping, [list(range(len(keyframes)))]
+        whole = len(keyframes) <= config.whole_keyframes
+        self._tiles = every if whole else make_tiles(np.array(centers), config.tile_keyframes)
 
     def _grown(self) -> tuple[list[MapUpdate], Any]:
         """Add all keyframes to the map, tile by tile; the messages about it, and the state of the map."""
@@ -166,13 +170,13 @@ class MapBuilder:
             done = len(updates) - len(before)
             mapper = self._mapper(number, before, taken=not done)
             for k in tile[:done]:
-                self._with_images(mapper.put_back, k)
+                self._with_images(mapper.put_back, k, seeds=True)
             if grown is not None:
                 mapper.go_on(grown)
             left = tile[done:]
             for k in progress_bar.track(left, f"mapping {self.name}") if self._progress else left:
                 add = partial(mapper.add_keyframe, iterations=steps[k])
-                stats = self._with_images(add, k)
+                stats = self._with_images(add, k, seeds=True)
                 updates.append(stats.message(self._keyframes[k], self.name, len(self._whole) + stats.total))
                 self._checkpoints.at(
                     part,
@@ -268,7 +272,7 @@ class MapBuilder:
             else:
                 mapper = self._mapper(number, every, taken=found is None, supporting=of_tile[number])
                 for k in tile:
-                    self._with_images(mapper.put_back, k)
+                    self._with_images(mapper.put_back, k, seeds=True)
             for frame in of_tile[number]:
                 self._support(mapper, frame)
             views = [
@@ -347,8 +351,9 @@ class MapBuilder:
         """T_map_camera of a keyframe, as refined so far."""
         return self._poses[self._keyframes[keyframe].frame_index]
 
-    def _with_images(self, do: Callable[..., Result], index: int) -> Result:
-        """Hand a keyframe to the mapper."""
+    def _with_images(self, do: Callable[..., Result], index: int, *, seeds: bool = False) -> Result:
+        """Hand a keyframe to the mapper; if it seeds, with the depth of what is too far to be measured."""
+        do = partial(do, far_m=self._far.of(index)) if seeds else do
         keyframe, T_map_camera = self._keyframes[index], self._pose(index)
         frame = self.log.frame(keyframe.frame_index)
         return do(

@@ -122,12 +122,12 @@ class MapContent:
         """Insert discs for what the map does not explain of a view; numbers of inserted and pruned Gaussians."""
         config = self.config
         budget = int(share * config.max_gaussians)
-        color, depth_m = view.images(0)
+        color, (depth_m, sigma_m) = view.images(0)[0], view.seed_depth
         wanted = depth_m > 0  # zero where the mask forbids a pixel
         if len(self._map):
             render = self._draw(view)
             color = self._as_drawn(view, color, render)
-            wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=view.depth_sigma_m)
+            wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=sigma_m)
         new = self._discs(view, color, depth_m, wanted, budget=budget)
         excess = len(self._map) + len(new) - self._map.cap
         views = [*self._borders, *self._views]
@@ -201,7 +201,7 @@ class MapContent:
         for k, view in enumerate(self._views):
             budget = room * (k + 1) // len(self._views) - room * k // len(self._views)
             render = self._draw(view)
-            color, depth_m = view.images(0)
+            color, depth_m = view.images(0)[0], view.seed_depth[0]
             color = self._as_drawn(view, color, render)
             budget = min(budget, depth_m.size // (8 * self.config.seeding.cell_sizes_px[-1] ** 2))
             wanted = worst_drawn(render, color, depth_m, count=budget, config=self.config.seeding)

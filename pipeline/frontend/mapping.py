@@ -167,6 +167,7 @@ class Mapper(MapContent):
         depth_sigma_m: Image | None = None,
         exposure: Exposure | None = None,
         information: NDArray[np.float64] | None = None,
+        far_m: Image | None = None,
         iterations: int | None = None,
     ) -> MappingStats:
         """Seed what the map does not explain of a new keyframe and optimize the window around it.
@@ -180,6 +181,7 @@ class Mapper(MapContent):
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
             exposure: of the image; None: as the map.
             information: [6, 6] of the pose; None: nothing is known of it.
+            far_m: [H, W], depth of what was too far to be measured, meters, 0 where it is unknown; None: nowhere.
             iterations: most optimization steps; None: those of the configuration.
         """
         last = self._views[-1].index if self._views else -1
@@ -195,6 +197,7 @@ class Mapper(MapContent):
             loss=self._loss_weights,
             exposure=exposure,
             information=information,
+            far_m=far_m,
         )
         first = not self._views and not len(self._map)
         self._views.append(view)

@@ -16,6 +16,9 @@ from duagc.pipeline.splat.losses import DepthTrust, depth_certainty, halve
 Image = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
+FAR_SIGMA = np.float32(0.1)
+"""Standard deviation of depth that was not measured, in units of it."""
+
 
 @dataclass
 class View:
@@ -39,6 +42,7 @@ class View:
         T_map_begun: [4, 4], the pose before it was refined.
         T_camera_moment: [k, 4, 4], as of `TrainingView`; None = the camera stands still.
         guests: rows of the Gaussians of other tiles that it may see; None = not looked for.
+        far_m: depth [H, W] of what was too far to be measured (`far_depth`), meters, 0 = unknown; None = nowhere.
     """
 
     index: int
@@ -58,6 +62,7 @@ class View:
     T_map_begun: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     T_camera_moment: NDArray[np.float64] | None = None
     guests: NDArray[np.int64] | None = None
+    far_m: Image | None = None
 
     @classmethod
     def of(
@@ -72,6 +77,7 @@ class View:
         loss: DepthTrust,
         exposure: Exposure | None = None,
         information: NDArray[np.float64] | None = None,
+        far_m: Image | None = None,
     ) -> View:
         """A view of images that are kept, not copied, but for depth where a mask forbids pixels.
 
@@ -85,6 +91,7 @@ class View:
             loss: how much uncertain depth counts.
             exposure: of the image; None = as the map.
             information: [6, 6] of the pose; None = nothing is known of it.
+            far_m: [H, W], depth that is no measurement, meters, 0 = unknown; None = nowhere.
         """
         if color.dtype != np.uint8:
             raise ValueError(f"color is an array of {color.dtype}, expected uint8")
@@ -107,7 +114,17 @@ class View:
             exposure=exposure,
             information=np.zeros((6, 6)) if information is None else information,
             T_map_begun=np.array(T_map_camera, dtype=np.float64),
+            far_m=None if far_m is None else np.where(depth_m > 0, np.float32(0), masked_depth(far_m, mask)),
         )
+
+    @property
+    def seed_depth(self) -> tuple[Image, Image | None]:
+        """Depth [H, W] of new Gaussians and its standard deviation: as measured, and as found where it is too far."""
+        if self.far_m is None:
+            return self.depth_m, self.depth_sigma_m
+        far, known = self.far_m > 0, self.depth_sigma_m
+        sigma_m = np.where(far, FAR_SIGMA * self.far_m, np.float32(0) if known is None else known)
+        return np.where(far, self.far_m, self.depth_m), sigma_m
 
     @property
     def center_map(self) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.image_sampling import sampled
 from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.registration.features import (
     DIMENSIONS,
@@ -38,7 +39,6 @@ VOTERS = 2000  # normals, evenly spread
 ROUNDS = 3  # of taking the mean of those that share it
 OUTSIDE = 2  # percent of the pixels on either side that a turned image does without
 MOST_PX = 150_000  # of a turned image: three times as many find no more loop closures
-STEPS = 32  # of a pixel, by which images are interpolated
 SAME_POINT = 0.02
 """Matches whose points are nearer to each other than this, at one meter, in both views, count once."""
 
@@ -190,16 +190,11 @@ class _TurnedView:
         return np.where(front, u, -1.0), np.where(front, v, -1.0)
 
     def image(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """What it sees, [height, width], by whole numbers, so that it is the same on every processor."""
-        import cv2
-
+        """What it sees, [height, width]."""
         width, height = self.size_px
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
         u, v = self.pixels(grid)
-        steps = [np.clip(np.rint(at * STEPS), -STEPS, 2**14 * STEPS).astype(np.int32) for at in (u, v)]
-        whole = np.stack([at // STEPS for at in steps], axis=-1).astype(np.int16)
-        rest = (steps[1] % STEPS * STEPS + steps[0] % STEPS).astype(np.uint16)
-        return np.asarray(cv2.remap(gray, whole, rest, cv2.INTER_LINEAR), dtype=np.uint8)
+        return sampled(gray, u, v)
 
 
 def matched_points(
