@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 
 STEPS = 32
-"""Parts of a pixel that are told apart."""
+"""Parts of a pixel that make a difference."""
 
 
 def sampled(image: NDArray[np.uint8], u: Array, v: Array) -> NDArray[np.uint8]:
