@@ -96,7 +96,10 @@ def run_case(reader: Reader, root: Path, number: int) -> Iterator[str]:
             kind, text = "failed", f"wrote {mutate.EVIL}"
         if _open_files() != open_before:
             gc.collect()
-            more = sorted(set(_open_files()) - set(open_before))
+            ends = time.monotonic() + 2.0
+            # threads that read ahead are not waited for: they end by themselves
+            while (more := sorted(set(_open_files()) - set(open_before))) and time.monotonic() < ends:
+                time.sleep(0.01)
             if more:
                 kind, text = "failed", f"left open: {more}"
         for thread in threading.enumerate():
