@@ -48,11 +48,17 @@ def check_apart(out: Path, inputs: Sequence[Path]) -> None:
         inputs: files and folders that are read, or kept.
 
     Raises:
-        DuagError: names the input.
+        DuagError: names the input, which lies there or is a link that leads back to itself.
     """
     place = out.resolve()
     for path in inputs:
-        if path.resolve().is_relative_to(place):
+        try:
+            found = path.resolve()
+        except (OSError, RuntimeError) as error:  # of Python before 3.13
+            raise DuagError(
+                f"{path}: a link that leads back to itself, expected a file or a folder"
+            ) from error
+        if found.is_relative_to(place):
             raise DuagError(f"{out}: found {path} in it, expected --out apart from what is read or kept")
 
 

@@ -1,6 +1,7 @@
 """Folders that appear whole: whatever stops the process, the old one or the new one is there."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -86,3 +87,10 @@ def test_an_output_that_holds_an_input_is_refused(tmp_path: Path) -> None:
             with pytest.raises(DuagError, match="expected --out apart"):
                 check_apart(tmp_path / out, [tmp_path, tmp_path / path])
     check_apart(tmp_path / "run", [tmp_path, tmp_path / "runs" / "recording"])
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="such links are found when the file is read")
+def test_an_input_that_is_a_link_to_itself_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "settings.toml").symlink_to(tmp_path / "settings.toml")
+    with pytest.raises(DuagError, match=r"settings\.toml: a link that leads back to itself"):
+        check_apart(tmp_path / "out", [tmp_path / "settings.toml"])
