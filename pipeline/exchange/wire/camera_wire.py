@@ -12,6 +12,8 @@ from duagc.pipeline.network.packets import MalformedError
 _CAMERA = struct.Struct("<HHdddd")
 MAX_FOCAL_PX = 1e6
 """Of any camera: a telescope."""
+LEAST_FOCAL = 0.1
+"""Of a side of the image: no pinhole camera sees more than 157 degrees."""
 
 
 def camera_bytes(camera: PinholeCamera) -> bytes:
@@ -27,7 +29,8 @@ def read_camera(reader: Reader) -> PinholeCamera:
     """
     width, height, fx, fy, cx, cy = reader.fields(_CAMERA)
     sides = min(width, height) >= 1 and max(width, height) <= MAX_SIDE_PX
-    focal = all(math.isfinite(f) and 0 < f <= MAX_FOCAL_PX for f in (fx, fy))
+    fields = zip((fx, fy), (width, height), strict=True)
+    focal = all(math.isfinite(f) and LEAST_FOCAL * side <= f <= MAX_FOCAL_PX for f, side in fields)
     # a principal point outside the image is that of a part of a larger one
     center = all(math.isfinite(c) and abs(c) <= MAX_SIDE_PX for c in (cx, cy))
     if not (sides and focal and center):
