@@ -306,7 +306,7 @@ class _PhotometricCheck:
         self.views, self.context, self.depth_kind, self.config = views, context, depth_kind, config
         self.rasterizer = Rasterizer(threads=context.threads)
         self.own, self.color_mse = _ColorStatistics(config.min_color_variance), 0.0
-        self._seen_px = self._first_px = 0  # that saw the whole map
+        self._seen_px = 0  # that saw the whole map
         self.num_contradicted = 0
 
     def trusted(self, own_px: int) -> bool:
@@ -325,7 +325,6 @@ class _PhotometricCheck:
         """Which Gaussians [n] own images contradict: error above `gray`, the variance of own colors."""
         gaussians = gaussians_of(world.ids, world.anchors, world.theta)
         against = self._judged(gaussians, np.zeros(len(world), bool), gray)
-        self._seen_px = self._first_px
         if self._explains:
             return against
         free, seen = self._in_free_space(world.theta[:, MEAN])
@@ -343,8 +342,8 @@ class _PhotometricCheck:
         for turn in range(self.config.passes):
             rows = np.flatnonzero(~against)
             errors = self._errors(gaussians.select(rows), count=turn == 0)
-            if not turn:
-                self._first_px = self.own.pixels
+            if not (turn or without.any()):
+                self._seen_px = self.own.pixels
             against[rows[errors > gray]] = True
             judged[rows[errors > 0]] = True
         false_share = int(np.sum(against & ~without)) / max(int(np.sum(judged)), 1)
