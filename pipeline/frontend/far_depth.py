@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.mapping import FarDepthConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.image_sampling import sampled
+from duagc.pipeline.geometry.projection import NEAR_M, inside, visible
 
 Image = NDArray[np.float32]
 WIDTH_PX = 160
@@ -61,10 +63,10 @@ class FarDepth:
         h, w = (length // self._step for length in self._size)
         whole = PinholeCamera(w * self._step, h * self._step, camera.fx, camera.fy, camera.cx, camera.cy)
         self._camera = whole.scaled(w, h)
-        self._grays: list[NDArray[np.uint8]] = []
-        self._depths: list[Image] = []
+        self._small: list[tuple[NDArray[np.uint8], Image]] = []  # gray and depth of each
         self._ranges_m: list[float] = []
         self._poses: list[Array] = []
+        self._found: dict[int, Image | None] = {}  # small ones too
 
     def add(self, color: NDArray[np.uint8], depth_m: Image, T_map_camera: Array) -> None:
         """Take in the next keyframe.
@@ -79,8 +81,8 @@ class FarDepth:
         h, w, s = self._camera.height, self._camera.width, self._step
         gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[: h * s, : w * s].reshape(h, s, w, s)
         sums = gray.sum(axis=(1, 3), dtype=np.uint32)
-        self._grays.append(((sums + s * s // 2) // (s * s)).astype(np.uint8))
-        self._depths.append(depth_m[: h * s, : w * s].reshape(h, s, w, s).max(axis=(1, 3)))
+        mean = ((sums + s * s // 2) // (s * s)).astype(np.uint8)
+        self._small.append(SHELF.put((mean, depth_m[: h * s, : w * s].reshape(h, s, w, s).max(axis=(1, 3)))))
         near = depth_m[::8, ::8]
         if (near > 0).any():
             self._ranges_m.append(float(np.percentile(near[near > 0], 95)))
@@ -94,13 +96,26 @@ class FarDepth:
         Returns:
             None if next to nothing is missing, or nothing is found.
         """
+        if keyframe not in self._found:
+            searched = self._searched(keyframe)
+            self._found[keyframe] = None if searched is None else SHELF.put(searched)
+        found = self._found[keyframe]
+        if found is None:
+            return None
+        whole = np.zeros(self._size, np.float32)
+        large = found.repeat(self._step, axis=0).repeat(self._step, axis=1)
+        whole[: large.shape[0], : large.shape[1]] = large
+        return whole
+
+    def _searched(self, keyframe: int) -> Image | None:
+        """The same of the small images [h, w]."""
         from scipy.ndimage import distance_transform_edt
 
         others, missing = self._others(keyframe), self._beyond(keyframe)
         if len(others) < 2 or np.mean(missing) < self._config.least_missing:
             return None
         part = _around(missing)
-        gray, rays = self._grays[keyframe][part], self._camera.rays()[part]
+        gray, rays = self._small[keyframe][0][part], self._camera.rays()[part]
         moved = [(k, se3.inverse(self._poses[k]) @ self._poses[keyframe]) for k in others]
         inverse = self._planes(keyframe, others)
         plane, sure = self._best_planes(self._correlations(gray, rays, moved, inverse))
@@ -110,12 +125,9 @@ class FarDepth:
         if not sure.any():
             return None
         apart_px, (row, column) = distance_transform_edt(~sure, return_indices=True)
-        found = np.zeros(missing.shape)
+        found = np.zeros(missing.shape, np.float32)
         found[part] = np.where(missing[part] & (apart_px <= self._config.filled_px), z[row, column], 0.0)
-        whole = np.zeros(self._size, np.float32)
-        large = found.astype(np.float32).repeat(self._step, axis=0).repeat(self._step, axis=1)
-        whole[: large.shape[0], : large.shape[1]] = large
-        return whole
+        return found
 
     def _beyond(self, keyframe: int) -> NDArray[np.bool_]:
         """Pixels [h, w] without depth, where the nearest that has some is near the end of the range.
@@ -124,11 +136,12 @@ class FarDepth:
         """
         from scipy.ndimage import distance_transform_edt
 
-        missing = self._depths[keyframe] == 0
+        _, depth_m = self._small[keyframe]
+        missing = depth_m == 0
         if missing.all() or not missing.any():
             return np.zeros_like(missing)
         row, column = distance_transform_edt(missing, return_distances=False, return_indices=True)
-        return np.asarray(missing & (self._depths[keyframe][row, column] > BORDER * self._range_m()))
+        return np.asarray(missing & (depth_m[row, column] > BORDER * self._range_m()))
 
     def _range_m(self) -> float:
         """How far the depth camera measures what the keyframes show."""
@@ -146,17 +159,14 @@ class FarDepth:
 
     def _seen(self, points: Array, moved: Sequence[tuple[int, Array]]) -> NDArray[np.bool_]:
         """Whether nothing measured hides points [h, w, 3] from most of the others that look there."""
-        seen, looked, camera = *np.zeros((2, *points.shape[:2]), np.int64), self._camera
+        seen, looked = np.zeros((2, points[..., 2].size), np.int64)
         for k, T_other_own in moved:
-            at = se3.transform(T_other_own, points)
-            ahead = at[..., 2] > 0.1
-            u, v = np.moveaxis(camera.project(np.where(ahead[..., None], at, [0.0, 0.0, 1.0])), -1, 0)
-            inside = ahead & (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
-            row, column = (np.where(inside, np.rint(c), 0).astype(np.int64) for c in (v, u))
-            measured_m = self._depths[k][row, column]
-            looked += inside
-            seen += inside & ((measured_m == 0) | (measured_m > HIDDEN * at[..., 2]))
-        return 2 * seen > looked
+            at = se3.transform(T_other_own, points.reshape(-1, 3))
+            index, column, row = visible(self._camera, at)
+            measured_m = self._small[k][1][row, column]
+            looked[index] += 1
+            seen[index] += (measured_m == 0) | (measured_m > HIDDEN * at[index, 2])
+        return (2 * seen > looked).reshape(points.shape[:-1])
 
     def _planes(self, keyframe: int, others: list[int]) -> Array:
         """Inverse depths [p], 1/m, from infinity to well within the range.
@@ -184,18 +194,19 @@ class FarDepth:
         The mean of the better half of them: a surface may be hidden from the others.
         """
         own, camera, (x0, y0, _) = _Windows(gray), self._camera, np.moveaxis(rays, -1, 0)
+        between_px = camera.height - 1, camera.width - 1  # of the centers of the outermost pixels
         turned = [np.stack([a * x0 + (b * y0 + c) for a, b, c in T[:3, :3]]) for _, T in moved]
         out, half = np.empty((len(inverse), *gray.shape), np.float32), max(2, (len(moved) + 1) // 2)
         for p, near in enumerate(inverse):
             found = np.full((len(moved), *gray.shape), -1.0, np.float32)
             for n, (k, T_other_own) in enumerate(moved):
                 x, y, z = turned[n] + (near * T_other_own[:3, 3])[:, None, None]
-                ahead = z > 0.1
+                ahead = z > NEAR_M
                 z = np.where(ahead, z, 1.0)
                 u, v = camera.fx * (x / z) + camera.cx, camera.fy * (y / z) + camera.cy
-                inside = ahead & (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
-                if inside.any():
-                    np.copyto(found[n], own.correlation(sampled(self._grays[k], u, v)), where=inside)
+                shown = ahead & inside(u, v, between_px)
+                if shown.any():
+                    np.copyto(found[n], own.correlation(sampled(self._small[k][0], u, v)), where=shown)
             found.sort(axis=0)
             out[p] = found[-half:].mean(axis=0)
         return out

@@ -19,9 +19,9 @@ from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.frontend.far_depth import FarDepth
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.joint_training import JointTraining, JointView
+from duagc.pipeline.frontend.keyframe_sights import KeyframeSights
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 from duagc.pipeline.frontend.mapping_budget import MappingBudget, alone_steps
 from duagc.pipeline.frontend.mapping_views import masked_depth
@@ -30,17 +30,15 @@ from duagc.pipeline.frontend.output import BuiltMap, Maps
 from duagc.pipeline.frontend.shutter import ShutterSearch
 from duagc.pipeline.frontend.supporting_frames import supporting_frames
 from duagc.pipeline.frontend.tile_checkpoints import TileCheckpoints
-from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_tile
+from duagc.pipeline.frontend.tiles import take_tile
 from duagc.pipeline.frontend.tracked import TrackedFrame, tracked_path
 from duagc.pipeline.frontend.view_gain import ViewGain
 from duagc.pipeline.frontend.view_poses import moved_frames
-from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdLog
-from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.splat.gaussians import Gaussians
 
 Result = TypeVar("Result")
@@ -79,11 +77,9 @@ class MapBuilder:
         self.log, self.config, self.name, self.exposures = log, config, name, exposures
         self._seed, self._depth, self._threads, self._progress = seed, depth, threads, progress
         self._budget = MappingBudget(config.mapping, log.camera, depth)
-        self._free = FreeSpace(log.camera, config.moving)
+        self._sights = KeyframeSights(log, config)
         self._whole = GrowingMap(config.mapping, threads=threads)
         self._keyframes: Sequence[Keyframe] = ()
-        self._far = FarDepth(log.camera, config.mapping.far)
-        self._sights: list[ViewExtent] = []
         self._tiles: list[list[int]] = []
         self._kept: Mapper | None = None  # the last tile that grew
         self._poses: dict[int, Array] = {}  # T_map_camera of views by frame index, as refined so far
@@ -98,7 +94,10 @@ class MapBuilder:
             frames: every frame of the log.
             clock: its laps get the times of the parts.
         """
-        self._look(keyframes)
+        self._keyframes = keyframes
+        self._poses = {k.frame_index: k.T_map_camera for k in keyframes}
+        self._sights.look(keyframes)
+        self._tiles = self._sights.tiles()
         save, config, threads = self._checkpoints, self.config, self._threads
         updates, state = save.done(f"{self.name}.mapping", self._grown)
         self._whole.go_on(state)
@@ -133,24 +132,6 @@ class MapBuilder:
         registered = self._registered(frames, after, frozenset(self._poses))
         clock.lap("model_s")
         return BuiltMap(updates, maps, registered, after, shutter_s)
-
-    def _look(self, keyframes: Sequence[Keyframe]) -> None:
-        """Look at all keyframes once: what moves in them, how far they see, and which make a tile."""
-        self._keyframes = keyframes
-        self._poses = {k.frame_index: k.T_map_camera for k in keyframes}
-        for keyframe in keyframes:
-            frame = self.log.frame(keyframe.frame_index)
-            depth_m = frame.usable_depth
-            self._far.add(frame.color, depth_m, keyframe.T_map_camera)
-            self._free.add(depth_m, keyframe.T_map_camera)
-            self._sights.append(ViewExtent.of(depth_m, self.log.camera))
-        centers = [
-            se3.transform(k.T_map_camera, sight.center_camera[None])[0]
-            for k, sight in zip(keyframes, self._sights, strict=True)
-        ]
-        config, every = self.config.mapping, [list(range(len(keyframes)))]
-        whole = len(keyframes) <= config.whole_keyframes
-        self._tiles = every if whole else make_tiles(np.array(centers), config.tile_keyframes)
 
     def _grown(self) -> tuple[list[MapUpdate], Any]:
         """Add all keyframes to the map, tile by tile; the messages about it, and the state of the map."""
@@ -213,7 +194,7 @@ class MapBuilder:
         border = self._border(tile, others)
         begun = GrowingMap(config, threads=self._threads)
         if taken:
-            seen = [(self._sights[k], self._pose(k)) for k in (*tile, *border)]
+            seen = [(self._sights.extents[k], self._pose(k)) for k in (*tile, *border)]
             for frame in supporting:
                 depth_m = self.log.frame(frame.frame_index).usable_depth
                 T_map_camera = self._pose(frame.keyframe_index) @ frame.T_keyframe_camera
@@ -235,10 +216,7 @@ class MapBuilder:
 
     def _border(self, tile: Sequence[int], others: Sequence[int]) -> list[int]:
         """Keyframes of other tiles, out of some, that take part in the optimization of a tile."""
-        if len(self._tiles) == 1:
-            return []
-        views = [(s, k.T_map_camera) for s, k in zip(self._sights, self._keyframes, strict=True)]
-        return border_keyframes(tile, others, views, self.config.mapping.border_keyframes)
+        return [] if len(self._tiles) == 1 else self._sights.border(tile, others)
 
     def _finalized(
         self, supporting: Sequence[TrackedFrame], log_s: float
@@ -332,7 +310,7 @@ class MapBuilder:
     def _posed(self, frame_index: int, T_map_tracked: Array) -> PosedRgbd:
         """A frame at its pose before refinement, by which it is known what moves."""
         frame = self.log.frame(frame_index)
-        mask = self._free.usable(frame.usable_depth, T_map_tracked, frame.mask, index=frame_index)
+        mask = self._sights.free.usable(frame.usable_depth, T_map_tracked, frame.mask, index=frame_index)
         return PosedRgbd(
             frame.color,
             masked_depth(frame.depth, mask),
@@ -353,7 +331,7 @@ class MapBuilder:
 
     def _with_images(self, do: Callable[..., Result], index: int, *, seeds: bool = False) -> Result:
         """Hand a keyframe to the mapper; if it seeds, with the depth of what is too far to be measured."""
-        do = partial(do, far_m=self._far.of(index)) if seeds else do
+        do = partial(do, far_m=self._sights.far_m(index)) if seeds else do
         keyframe, T_map_camera = self._keyframes[index], self._pose(index)
         frame = self.log.frame(keyframe.frame_index)
         return do(
@@ -361,7 +339,7 @@ class MapBuilder:
             frame.color,
             frame.depth,
             T_map_camera,
-            mask=self._free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
+            mask=self._sights.free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
             exposure=self.exposures.at(frame.index),
             information=keyframe.information,
@@ -377,7 +355,7 @@ class MapBuilder:
             frame.color,
             frame.depth,
             supporting.T_keyframe_camera,
-            mask=self._free.usable(frame.usable_depth, T_map_camera, frame.mask),
+            mask=self._sights.free.usable(frame.usable_depth, T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
             exposure=self.exposures.at(frame.index),
             information=supporting.information,

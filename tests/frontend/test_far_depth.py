@@ -1,13 +1,22 @@
 """Depth beyond the range of the depth camera: a floor that is measured up to 3 m, and a wall at 6 m that is not."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.mapping import FarDepthConfig, MappingConfig
+from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.frontend.far_depth import FarDepth
 from duagc.pipeline.frontend.mapping import Mapper
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import read_log
+from duagc.schemas import topics
+from tests.frontend.test_checkpoints import SMALL, Runs, undisturbed
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 159.5, 119.5)
 RANGE_M, WALL_M, FLOOR_M = 3.0, 6.0, 0.6
@@ -17,10 +26,10 @@ PHASES = np.random.default_rng(4).uniform(0, 2 * np.pi, 40)
 
 
 def shot(
-    T: np.ndarray, gain: float = 1.0, contrast: float = 1.0
+    T: np.ndarray, gain: float = 1.0, contrast: float = 1.0, camera: PinholeCamera = CAMERA
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Color, depth as measured, and true depth."""
-    rays = CAMERA.rays() @ T[:3, :3].T
+    rays = camera.rays() @ T[:3, :3].T
     with np.errstate(divide="ignore"):
         floor, wall = (FLOOR_M - T[1, 3]) / rays[..., 1], (WALL_M - T[2, 3]) / rays[..., 2]
     z = np.minimum(np.where(floor > 0, floor, np.inf), wall)
@@ -94,3 +103,29 @@ def test_a_map_is_seeded_there_and_is_not_trained_on_it() -> None:
     view = mappers[1]._views[0]
     assert np.array_equal(view.training(0).depth_m, depth_m)
     assert np.array_equal(view.depth_m, depth_m)
+
+
+def write(folder: Path) -> Path:
+    """A log of a robot that walks along the wall, and up and down, and looks at floor and wall."""
+    camera = CAMERA.halved()
+    with RecordingWriter(folder) as recording, recording.robot("alpha", camera, 0.0005) as robot:
+        for k in range(12):
+            height, pitch = 0.1 * np.sin(0.5 * k), -0.15 + 0.02 * np.sin(0.4 * k)
+            T = se3.exp(np.array([0.04 * k, height, 0.01 * k, pitch, 0.003 * k, 0]))
+            color, depth_m, _ = shot(T, camera=camera)
+            raw = np.rint(depth_m / 0.0005).astype(np.uint16)
+            robot.add_frame(33_333_333 * k, cv2.imencode(".png", color)[1].tobytes(), "png", raw)
+    return folder / "alpha.mcap"
+
+
+def test_the_stage_seeds_there_also_when_it_was_killed(tmp_path: Path) -> None:
+    overrides = [*SMALL, "frontend.mapping.max_gaussians=6000", "frontend.keyframes.min_overlap=0.93"]
+    overrides += ["frontend.mapping.iterations=2", "frontend.mapping.final_iterations=4"]
+    config = load_config(RunConfig, overrides=overrides).frontend
+    log = write(tmp_path / "recording")
+    digest, _ = undisturbed(log, config, tmp_path)
+    (map_message,) = (r.message() for r in read_log(tmp_path / "undisturbed.mcap", (topics.MAP.of("alpha"),)))
+    assert (map_message.gaussians.means[:, 2] > 1.5 * RANGE_M).sum() > 100
+    killed = Runs(log, tmp_path, config)
+    assert killed.until_done(17) == digest
+    assert [line for line in killed.said if line.startswith("alpha.final: goes on")], killed.said
