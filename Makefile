@@ -9,7 +9,7 @@ TEST_WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
-SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/*) $(wildcard pipeline/base/stand_ins/*.[ht]*)
+SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/* converters/simulate/render/src/*) $(wildcard pipeline/base/stand_ins/*.[ht]*)
 SANITIZED := build/sanitize/.built
 DEMO := outputs/demo
 DOCS_VENV := build/docs-venv
@@ -102,4 +102,4 @@ format: setup
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf build pipeline/kernels/*.so pipeline/base/stand_ins/*.so $(STAMP)
+	rm -rf build pipeline/kernels/*.so converters/simulate/render/*.so pipeline/base/stand_ins/*.so $(STAMP)

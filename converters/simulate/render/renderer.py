@@ -4,6 +4,8 @@ A flat surface seen by a pinhole camera has an inverse depth D = 1/z that is lin
 s D and t D of its coordinates (s, t). Visibility is a maximum of D over surfaces, in float64, at pixel centers.
 Color takes 2 x 2 samples of the surface at the center, or, next to a border between surfaces, 4 x 4 samples of
 whatever each of them hits; textures are read at the mip level whose texels are as large as the samples are apart.
+Pixels of flat surfaces, which most are, are drawn by compiled code (src/flat_surfaces.h); the others as below, which
+gives the same bits for all.
 """
 
 from collections.abc import Iterator
@@ -14,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.converters.simulate.render import _flat_surfaces
 from duagc.converters.simulate.render.bake import Atlas
 from duagc.converters.simulate.scenes.scene import Ball, Flat, Scene, Side, Surface
 from duagc.pipeline.base.arrays import Array
@@ -21,6 +24,8 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 
 NEAR_M = 0.05
 EDGE_TOLERANCE_M = 1e-9  # rays that pass exactly between two faces of a box hit one of them
+FINEST_STEP2 = 4.0  # squared texels
+RECTANGLE, DISC, CURVED = range(3)  # kinds of surfaces
 INSIDE_OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 BORDER_OFFSETS = np.array(
     [(x, y) for y in (-0.375, -0.125, 0.125, 0.375) for x in (-0.375, -0.125, 0.125, 0.375)]
@@ -51,8 +56,19 @@ class CameraRenderer(Protocol):
 class Renderer:
     """Renders one baked scene with one camera."""
 
-    def __init__(self, scene: Scene, atlas: Atlas | None, camera: PinholeCamera) -> None:
-        self.camera, self.atlas = camera, atlas
+    def __init__(
+        self, scene: Scene, atlas: Atlas | None, camera: PinholeCamera, *, isa: str = "auto"
+    ) -> None:
+        """Initialize.
+
+        Args:
+            scene: what is seen.
+            atlas: its colors; None: depth alone is rendered.
+            camera: that sees it.
+            isa: how colors are drawn, which changes no bit: "fused" or "portable", compiled, "auto", the faster of
+                these, or "numpy".
+        """
+        self.camera, self.atlas, self.isa = camera, atlas, isa
         self.surfaces = scene.surfaces
         self.flat = np.array([k for k, s in enumerate(self.surfaces) if isinstance(s, Flat)])
         self.curved = [k for k, s in enumerate(self.surfaces) if not isinstance(s, Flat)]
@@ -69,6 +85,7 @@ class Renderer:
         self.is_curved[self.curved] = True
         self.period = np.zeros(len(self.surfaces))
         self.period[self.curved] = [self.surfaces[k].size[0] for k in self.curved]
+        self.kind = np.where(self.is_curved, CURVED, np.where(self.round, DISC, RECTANGLE)).astype(np.uint8)
         self.curved_faces = np.array([_faces_around(self.surfaces[k]) for k in self.curved])
         self.u = np.arange(camera.width, dtype=np.float64)
         self.v = np.arange(camera.height, dtype=np.float64)
@@ -86,31 +103,56 @@ class Renderer:
         inverse, surface = self._nearest(pose)
         depth = np.zeros_like(inverse)
         np.divide(1.0, inverse, out=depth, where=inverse > 0)
+        return RenderedView(self._colors(pose, surface), depth, surface)
+
+    def _colors(self, pose: "_Pose", surface: NDArray[np.int16]) -> NDArray[np.uint8]:
+        """Colors [h, w, 3] of an image of surfaces."""
+        assert self.atlas is not None
+        image = np.zeros((*surface.shape, 3), dtype=np.uint8)
+        left, step2 = np.zeros(surface.shape, dtype=np.uint8), np.zeros(surface.shape, dtype=np.float32)
+        if self.isa == "numpy":
+            left[:] = 1
+            self._color_others(pose, surface, left, image)
+            return image
+        of_scene = pose.linear, self.extent, self.kind, self.atlas.origin
+        levels, scale = self.atlas.levels, 1 / self.atlas.texel_m
+        _flat_surfaces.colors(self.isa, *of_scene, surface, levels[0], scale, image, step2, left)
+        far = np.flatnonzero(step2 > FINEST_STEP2)
+        if far.size:
+            level = self._level(step2.ravel()[far])
+            _flat_surfaces.colors_between(self.isa, *of_scene, surface, levels, scale, far, level, image)
+        if left.any():
+            self._color_others(pose, surface, left, image)
+        return image
+
+    def _level(self, step2: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Mip levels [n] for samples that are so far apart (squared, texels)."""
+        assert self.atlas is not None
+        return np.clip(0.5 * np.log2(step2) - 1, 0, len(self.atlas.levels) - 1.001).astype(np.float32)
+
+    def _color_others(
+        self, pose: "_Pose", surface: NDArray[np.int16], left: NDArray[np.uint8], image: NDArray[np.uint8]
+    ) -> None:
+        """Color the pixels of an image that are left."""
         window = np.ones((3, 3), dtype=np.uint8)
-        border = (cv2.dilate(surface, window) != cv2.erode(surface, window)).ravel()
-        seen = surface.ravel()
-        color = np.zeros((seen.size, 3), dtype=np.float32)
-        inside = np.flatnonzero(~border & (seen >= 0))
-        inside = inside[np.argsort(seen[inside], kind="stable")]
-        color[inside] = self._inside(pose, inside, seen[inside])
-        at = np.flatnonzero(border)
+        border = cv2.dilate(surface, window) != cv2.erode(surface, window)
+        seen, color = surface.ravel(), image.reshape(-1, 3)
+        inside = np.flatnonzero((left != 0) & ~border & (surface >= 0))
+        if inside.size:
+            inside = inside[np.argsort(seen[inside], kind="stable")]
+            color[inside] = _rounded(self._inside(pose, inside, seen[inside]))
+        at = np.flatnonzero((left != 0) & border)
         if at.size:
-            color[at] = self._border(pose, at, surface)
-        image = np.clip(np.rint(color), 0, 255).astype(np.uint8).reshape(*surface.shape, 3)
-        return RenderedView(image, depth, surface)
+            color[at] = _rounded(self._border(pose, at, surface))
 
     def _nearest(self, pose: "_Pose") -> tuple[Array, NDArray[np.int16]]:
         """Greatest inverse depth and its surface at every pixel center."""
         nearest = np.zeros((self.camera.height, self.camera.width))
         surface = np.full(nearest.shape, -1, dtype=np.int16)
+        order, windows = pose.flat_windows()
+        isa = "auto" if self.isa == "numpy" else self.isa
+        _flat_surfaces.nearest(isa, pose.linear, self.extent, self.kind, order, windows, nearest, surface)
         u, v = self.u, self.v[:, None]
-        for k, (u0, v0, u1, v1) in pose.flat_windows():
-            win = (slice(v0, v1), slice(u0, u1))
-            inverse, s, t = (c[0] * u[u0:u1] + (c[1] * v[v0:v1] + c[2]) for c in pose.linear[k])
-            hit = inverse > nearest[win]
-            hit &= self._covers(k, inverse, s, t)
-            np.copyto(nearest[win], inverse, where=hit)
-            surface[win][hit] = k
         for k, (u0, v0, u1, v1) in pose.curved_windows():
             win = (slice(v0, v1), slice(u0, u1))
             inverse, _, _ = pose.curved(k, *np.broadcast_arrays(u[u0:u1], v[v0:v1]))
@@ -173,13 +215,13 @@ class Renderer:
         n = x.shape[1]
         step = np.maximum((x[1] - x[0]) ** 2 + (y[1] - y[0]) ** 2, (x[2] - x[0]) ** 2 + (y[2] - y[0]) ** 2)
         mean = np.empty((n, 3), dtype=np.float32)
-        fine = step <= 4.0  # the finest level holds nothing that samples two texels apart would miss
+        fine = step <= FINEST_STEP2  # the finest level holds nothing that samples two texels apart would miss
         far = np.flatnonzero(~fine)
         if not far.size:
             return self._mean_of_four(0, x, y)
         near = np.flatnonzero(fine)
         mean[near] = self._mean_of_four(0, x[:, near], y[:, near])
-        level = np.clip(0.5 * np.log2(step[far]) - 1, 0, len(self.atlas.levels) - 1.001).astype(np.float32)
+        level = self._level(step[far])
         whole = level.astype(np.int64)
         for k in range(len(self.atlas.levels) - 1):
             some = np.flatnonzero(whole == k)
@@ -270,8 +312,8 @@ class _Pose:
         self.linear = np.zeros((len(renderer.surfaces), 3, 3))
         self.linear[renderer.flat] = np.stack([D, s, t], axis=1)
 
-    def flat_windows(self) -> list[tuple[int, tuple[int, int, int, int]]]:
-        """Flat surfaces that may be seen, nearest corner first, with the pixels (u0, v0, u1, v1) that bound them."""
+    def flat_windows(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Flat surfaces [n] that may be seen, nearest corner first, and pixels (u0, v0, u1, v1) [n, 4] around each."""
         r = self.renderer
         extent = r.extent[r.flat]
         unit = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
@@ -282,7 +324,7 @@ class _Pose:
         seen = self.faces & (window[:, 0] < window[:, 2]) & (window[:, 1] < window[:, 3])
         order = np.flatnonzero(seen)
         order = order[np.argsort(nearest[order], kind="stable")]
-        return [(int(r.flat[k]), tuple(window[k].tolist())) for k in order]
+        return r.flat[order].astype(np.int32), window[order].astype(np.int32)
 
     def _bounds(self, corners_world: Array) -> tuple[Array, Array, Array]:
         """Pixel bounds (low, high, [n, 2]) of convex polygons [n, m, 3] cut at the near plane, and their least z."""
@@ -346,6 +388,10 @@ class _Pose:
             t = np.arccos(np.clip(q[..., 2] / surface.radius, -1, 1)) * surface.radius
             hit = (root > 0) & (z > NEAR_M)
         return np.where(hit, 1 / np.where(hit, z, 1.0), 0.0), s, t
+
+
+def _rounded(color: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(color), 0, 255).astype(np.uint8)
 
 
 def _runs(values: NDArray[np.int16]) -> Iterator[tuple[int, slice]]:

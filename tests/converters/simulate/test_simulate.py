@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -114,6 +115,21 @@ def test_color_is_the_mean_over_the_pixel(room, atlas, renderer, ways):
         assert (
             np.abs(large.depth[2::5, 2::5] - view.depth).max() < 1e-9
         )  # the middle of the block is the pixel
+
+
+@pytest.mark.parametrize("isa", ["auto", "portable"])
+@pytest.mark.parametrize("shift_texels", [0.0, -70.3])  # shifted, some surfaces have no texels
+def test_compiled_colors_are_those_of_numpy(room, atlas, ways, isa, shift_texels):
+    along_a_wall = se3.from_rotation_translation(
+        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.array([0.02, 0.4, 1.2])
+    )
+    colors = replace(atlas, origin=atlas.origin + shift_texels)
+    for camera in (camera_of(SIZE), PinholeCamera(101, 67, 40.0, 40.0, 33.0, 31.0)):
+        compiled, plain = (Renderer(room, colors, camera, isa=each) for each in (isa, "numpy"))
+        for T in (*some_poses(ways), along_a_wall):
+            one, other = compiled.render(T), plain.render(T)
+            assert np.array_equal(one.color, other.color)
+            assert np.array_equal(one.surface, other.surface)
 
 
 def test_views_show_many_surfaces_and_many_features(renderer, ways):
