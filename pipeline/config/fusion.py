@@ -98,6 +98,12 @@ class PeerValidationConfig(Config):
     left out of a map that explains too little."""
     min_explained_by_rest: float = Field(default=0.5, ge=0.0, le=1.0)
     """Share of the variance that it must explain then."""
+    min_correlated: float = Field(default=0.25, ge=0.0, le=1.0)
+    """Share of the blocks of own images that correlate with what a map shows there, from which on it is used however
+    little of the variance it explains: 0.38 and more of honest maps, also of those seen from behind; at most 0.14 of
+    made-up colors, or of a map that is moved by 3 cm."""
+    min_blocks: int = Field(default=50, ge=1)
+    """Blocks that this takes; `pipeline/fusion/correlated_blocks.py` says how large they are."""
     passes: int = Field(default=2, ge=1)
     """Times that the map is rendered; Gaussians behind a contradicted one are judged in the next pass."""
     max_size_ratio: float = Field(default=2.0, gt=0.0)

@@ -12,7 +12,8 @@ variance of the own images. A peer as a whole is contradicted if its map does no
 pixels that it was judged on, neither as it is nor, if they are few, without the Gaussians that are contradicted: where
 a camera measures no depth, honest maps hold Gaussians that are right in that camera's own views alone. In front of all
 else they hide what is true; if need be a map is judged without all that stands in space that own depth images saw
-through.
+through. A map that is seen from behind may show more that is wrong than right, and still most of what it shows in
+detail is there: then blocks of the images decide, of which a false map shows few.
 What no own keyframe saw cannot be judged.
 
 Matches are checked, too, because the lower-named robot of a pair decides on them: two Gaussians that are not near each
@@ -32,18 +33,15 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.row_blocks import in_blocks
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.consensus import MapMatching
-from duagc.pipeline.config.fusion import PeerValidationConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import team_colors
 from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
 from duagc.pipeline.consensus.matching import Pairs, gaussian_distance, threshold, without
 from duagc.pipeline.fusion.context import MapContext
-from duagc.pipeline.geometry import se3, spd
+from duagc.pipeline.fusion.photometric_check import ColorStatistics, PhotometricCheck
+from duagc.pipeline.geometry import spd
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
-from duagc.pipeline.geometry.projection import visible
-from duagc.pipeline.kernels import Rasterizer
-from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN, gaussians_of
+from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN
 
 Index = NDArray[np.int64]
 NO_PAIRS: Index = np.zeros((0, 2), np.int64)
@@ -141,7 +139,7 @@ def validate_peer_maps(
         arrived: share of their Gaussians that are here, by name.
     """
     config, matching = context.config.peer_validation, context.matching
-    own_colors = _ColorStatistics(config.min_color_variance)
+    own_colors = ColorStatistics(config.min_color_variance)
     for view in views:
         own_colors.add(view.unit_color[... if view.mask is None else view.mask])
     own_m = _sizes_m(own).max() if len(own) else np.inf
@@ -154,7 +152,7 @@ def validate_peer_maps(
         peer = peers[name] if possible.all() else SHELF.put(peers[name].select(possible))
         too_large[name] = int(np.sum(~possible))
         near = _near(own, peer, _between(pairs, own.owner, name), radius_m)
-        judged[name] = _PhotometricCheck(views, context, depth_kinds[name], config, arrived=arrived[name])
+        judged[name] = PhotometricCheck(views, context, depth_kinds[name], config, arrived=arrived[name])
         shown = SHELF.put(_in_colors_of(own, peer, near, matching))
         against = judged[name].contradicted(shown, own_colors.variance)
         used = slice(None) if judged[name].trusted(own_colors.pixels) else slice(0, 0)
@@ -260,139 +258,3 @@ def _rejected(received: Mapping[str, Evidence], pairs: Pairs, true: Pairs) -> di
         if len(left):
             rejected[a, b] = left
     return rejected
-
-
-class _ColorStatistics:
-    """Variance of colors 0..1, summed as they come."""
-
-    def __init__(self, least_variance: float) -> None:
-        self.least_variance = least_variance
-        self.pixels, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
-
-    def add(self, colors: NDArray[np.float32]) -> None:
-        """Colors [..., 3]."""
-        c = colors.reshape(-1, 3)
-        self.pixels += len(c)
-        self._sum += c.sum(axis=0, dtype=np.float64)
-        self._squares += (c**2).sum(axis=0, dtype=np.float64)
-
-    @property
-    def variance(self) -> float:
-        """Mean over the channels, of colors 0..1; not below the least one."""
-        n = max(self.pixels, 1)
-        return max(float(np.mean(self._squares / n - (self._sum / n) ** 2)), self.least_variance)
-
-
-class _PhotometricCheck:
-    """Renders one peer's map at own keyframes.
-
-    Attributes:
-        explained: share of the variance of own pixels that the map must explain.
-        own: own colors at the pixels on which the whole map was compared.
-        color_mse: mean squared error of the map there, colors 0..1.
-        num_contradicted: Gaussians that own images contradict.
-    """
-
-    def __init__(
-        self,
-        views: Sequence[PosedRgbd],
-        context: MapContext,
-        depth_kind: DepthKind,
-        config: PeerValidationConfig,
-        *,
-        arrived: float,
-    ) -> None:
-        self.explained = config.min_explained_variance * arrived
-        self.views, self.context, self.depth_kind, self.config = views, context, depth_kind, config
-        self.rasterizer = Rasterizer(threads=context.threads)
-        self.own, self.color_mse = _ColorStatistics(config.min_color_variance), 0.0
-        self._seen_px = 0  # that saw the whole map
-        self.num_contradicted = 0
-
-    def trusted(self, own_px: int) -> bool:
-        """Whether the map explains own images, or too few of all own pixels see it to decide.
-
-        Of a map with holes as much is expected as there is of it; what is wrong explains nothing, however little it is.
-        """
-        return self._explains or self._seen_px < self.config.min_overlap * own_px
-
-    @property
-    def _explains(self) -> bool:
-        """Whether the colors of the map explain enough where it is seen."""
-        return self.color_mse <= (1 - self.explained) * self.own.variance
-
-    def contradicted(self, world: Evidence, gray: float) -> NDArray[np.bool_]:
-        """Which Gaussians [n] own images contradict: error above `gray`, the variance of own colors."""
-        gaussians = gaussians_of(world.ids, world.anchors, world.theta)
-        against = self._judged(gaussians, np.zeros(len(world), bool), gray)
-        if self._explains:
-            return against
-        free, seen = self._in_free_space(world.theta[:, MEAN])
-        if free.any() and np.sum(free) <= self.config.max_in_free_space * np.sum(seen):
-            self.explained = max(self.explained, self.config.min_explained_by_rest)
-            against = self._judged(gaussians, free, gray)
-        return against
-
-    def _judged(self, gaussians: Gaussians, without: NDArray[np.bool_], gray: float) -> NDArray[np.bool_]:
-        """Which Gaussians [n] are contradicted, drawn without some, which are; own colors are counted anew.
-
-        If it explains too little because of few of them, it is judged by the rest.
-        """
-        against, judged = without.copy(), np.zeros_like(without)
-        for turn in range(self.config.passes):
-            rows = np.flatnonzero(~against)
-            errors = self._errors(gaussians.select(rows), count=turn == 0)
-            if not (turn or without.any()):
-                self._seen_px = self.own.pixels
-            against[rows[errors > gray]] = True
-            judged[rows[errors > 0]] = True
-        false_share = int(np.sum(against & ~without)) / max(int(np.sum(judged)), 1)
-        if not self._explains and false_share <= self.config.max_contradicted:  # what is not used may be why
-            self._errors(gaussians.select(~against), count=True)
-            self.explained = max(self.explained, self.config.min_explained_by_rest)
-        return against
-
-    def _in_free_space(self, means_world: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which places [n, 3] most own depth images that see as far measured beyond; and which any of them saw."""
-        config, camera = self.context.config, self.context.camera
-        beyond, there = np.zeros((2, len(means_world)), np.int64)
-        for view in self.views:
-            at = se3.transform(se3.inverse(view.T_world_camera), means_world)
-            index, column, row = visible(camera, at)
-            z, measured_m = at[index, 2], view.usable_depth[row, column].astype(np.float64)
-            slack_m = config.explained_m + config.explained_relative * z
-            known = measured_m > 0
-            beyond[index] += known & (measured_m > z + slack_m)
-            there[index] += known & (np.abs(measured_m - z) <= slack_m)
-        return beyond > there, beyond + there > 0
-
-    def _errors(self, gaussians: Gaussians, *, count: bool) -> Array:
-        """Mean squared error of the pixels of each Gaussian [n], zero of too few; `count`: own colors there, anew."""
-        if count:
-            self.own = _ColorStatistics(self.config.min_color_variance)
-        errors, weights = np.zeros(len(gaussians)), np.zeros(len(gaussians))
-        total, fusion, least = 0.0, self.context.config, self.config.min_opacity
-        for view in self.views:
-            render = self.rasterizer.forward(
-                gaussians,
-                self.context.camera,
-                se3.inverse(view.T_world_camera),
-                mask=view.mask,
-                depth_kind=self.depth_kind,
-            )
-            alpha = np.maximum(render.alpha, np.float32(least))
-            reach = view.depth_m * (1 + fusion.explained_relative) + fusion.explained_m
-            judged = (render.alpha >= least) & (view.depth_m > 0) & (render.depth / alpha <= reach)
-            off = render.color / alpha[..., None] - view.unit_color
-            images = np.zeros_like(render.color)
-            images[..., 0] = np.where(judged, np.mean(np.clip(off, -1, 1) ** 2, axis=2), 0)
-            images[..., 1] = judged
-            sums = self.rasterizer.backward(images).colors  # of weight times image, over the pixels
-            errors, weights = errors + sums[:, 0], weights + sums[:, 1]
-            total += float(images[..., 0].sum(dtype=np.float64))
-            if count:
-                self.own.add(view.unit_color[judged])
-        if count:
-            self.color_mse = total / max(self.own.pixels, 1)
-        least_px = self.config.min_gaussian_px
-        return np.where(weights >= least_px, errors / np.maximum(weights, least_px), 0.0)

@@ -31,9 +31,13 @@ HERE = np.eye(4)[None]
 
 @pytest.fixture(scope="module")
 def views() -> list[PosedRgbd]:
+    return seen_from_poses(wall())
+
+
+def seen_from_poses(discs: Gaussians) -> list[PosedRgbd]:
     out = []
     for T in POSES:
-        render = Rasterizer().forward(wall(), CAMERA, se3.inverse(T))
+        render = Rasterizer().forward(discs, CAMERA, se3.inverse(T))
         alpha = np.maximum(render.alpha, 1e-6)
         color = np.rint(255 * np.clip(render.color / alpha[..., None], 0, 1)).astype(np.uint8)
         depth = np.where(render.alpha > 0.5, render.depth / alpha, 0).astype(np.float32)
@@ -250,6 +254,21 @@ def test_what_is_contradicted_counts_once(views, veils, trusted):
     used = validated.uncontradicted["bravo"].ids if trusted else []
     assert len(used) > 0.8 * N or not trusted
     assert not trusted or check.color_mse < 0.5 * check.color_variance
+
+
+@pytest.mark.parametrize(("wrong", "trusted"), [(0.5, True), (0.9, False)])
+def test_a_map_that_is_right_in_many_places_is_used_there(wrong, trusted):
+    """As one that is seen from behind: more of it is wrong than right, and blocks of the images decide."""
+    discs = speckled()
+    seen = seen_from_poses(discs)
+    theta, across = theta_of(discs), discs.means[:, 0]
+    false = across < np.quantile(across, wrong)
+    theta[false, COLOR] = np.random.default_rng(3).random((int(false.sum()), 3)).round()
+    ids = 10 + np.arange(len(theta))
+    peer = Evidence("bravo", ids, np.zeros(len(ids), np.int32), theta, np.ones((len(ids), 31)))
+    (check,) = validated_by_alpha(seen, peer).checks
+    assert check.color_mse > 0.7 * check.color_variance
+    assert check.trusted == trusted
 
 
 @pytest.mark.parametrize(("layers", "trusted"), [(2, True), (4, True), (20, False)])
