@@ -1,11 +1,13 @@
 """Frames of a simulated recording: rendered, disturbed and encoded, in as many processes as asked for."""
 
+import pickle
 import tempfile
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -25,7 +27,7 @@ from duagc.converters.simulate.sensors.lens import Lens
 from duagc.converters.simulate.sensors.light import vignette, with_light
 from duagc.converters.simulate.sensors.rig import BASELINE_M, MovingCamera, Rig, with_gain
 from duagc.converters.simulate.settings import Cover, SimulationSettings
-from duagc.converters.simulate.simulated_scenes import SceneOnDisk, SimulatedScene
+from duagc.converters.simulate.simulated_scenes import SimulatedScene
 from duagc.pipeline.base import determinism, random_streams
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -273,43 +275,54 @@ def _units(depth_m: NDArray[np.float64], scale_m: float) -> NDArray[np.uint16]:
 
 
 class RenderPool:
-    """Frame renderers in worker processes, which share one scene on disk; a single worker renders in this process."""
+    """Worker processes that render frames of one scene on disk; a single worker renders in this process.
 
-    def __init__(self, scene: SimulatedScene, settings: FrameSettings, workers: int) -> None:
+    They start, and import what they need, while the scene is set up.
+    """
+
+    def __init__(self, workers: int) -> None:
         """Initialize.
 
         Args:
-            scene: what is seen.
-            settings: what all frames have in common.
             workers: how many processes.
         """
-        self.scene, self.settings, self.workers = scene, settings, workers
+        self.workers = workers
         self._pool: ProcessPoolExecutor | None = None
         self._open = ExitStack()
 
     def __enter__(self) -> "RenderPool":
         if self.workers > 1:
-            folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix="duagc-atlas-"))
-            start = (self.scene.store(Path(folder)), self.settings)
-            self._pool = self._open.enter_context(worker_pool(self.workers, _start_worker, start))
+            prefix = "duagc-atlas-"
+            self._folder = Path(self._open.enter_context(tempfile.TemporaryDirectory(prefix=prefix)))
+            self._pool = self._open.enter_context(worker_pool(self.workers, determinism.configure_opencv))
+            for _ in range(self.workers):
+                self._pool.submit(_begin)
         return self
 
-    def images(self, jobs: list[FrameJob]) -> Iterator[FrameImages]:
+    def images(
+        self, scene: SimulatedScene, settings: FrameSettings, jobs: list[FrameJob]
+    ) -> Iterator[FrameImages]:
         """The images of all jobs, in their order; a few are in work ahead of the one that is asked for, from now on.
 
         Args:
+            scene: what is seen; a pool renders one.
+            settings: what all frames have in common.
             jobs: the frames.
         """
         if self._pool is None:
-            return map(FrameRenderer(self.scene, self.settings).render, jobs)
+            return map(FrameRenderer(scene, settings).render, jobs)
+        start = self._folder / "start.pickle"
+        start.write_bytes(pickle.dumps((scene.store(self._folder), settings)))
         left = iter(jobs)
-        ahead = deque(self._pool.submit(_render, job) for job in islice(left, 4 * self.workers))
-        return self._in_order(ahead, left)
+        ahead = deque(self._pool.submit(_render, start, job) for job in islice(left, 4 * self.workers))
+        return self._in_order(ahead, start, left)
 
-    def _in_order(self, ahead: deque[Future[FrameImages]], left: Iterator[FrameJob]) -> Iterator[FrameImages]:
+    def _in_order(
+        self, ahead: deque[Future[FrameImages]], start: Path, left: Iterator[FrameJob]
+    ) -> Iterator[FrameImages]:
         assert self._pool is not None
         while ahead:
-            ahead.extend(self._pool.submit(_render, job) for job in islice(left, 1))
+            ahead.extend(self._pool.submit(_render, start, job) for job in islice(left, 1))
             yield ahead.popleft().result()
 
     def __exit__(
@@ -318,17 +331,17 @@ class RenderPool:
         self._open.__exit__(kind, error, trace)
 
 
-_renderer: FrameRenderer | None = None
+def _begin() -> None:
+    """Nothing: that a worker process is asked for it makes it start."""
 
 
-def _start_worker(stored: SceneOnDisk, settings: FrameSettings) -> None:
-    """Set up the renderer of a worker process."""
-    global _renderer
-    determinism.configure_opencv()
-    _renderer = FrameRenderer(stored.open(), settings)
+@cache
+def _renderer_of(start: Path) -> FrameRenderer:
+    """The renderer of a worker process, of a scene that is stored, and of settings."""
+    stored, settings = pickle.loads(start.read_bytes())
+    return FrameRenderer(stored.open(), settings)
 
 
-def _render(job: FrameJob) -> Any:
+def _render(start: Path, job: FrameJob) -> Any:
     """One frame, in a worker process."""
-    assert _renderer is not None
-    return _renderer.render(job)
+    return _renderer_of(start).render(job)

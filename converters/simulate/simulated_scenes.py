@@ -1,5 +1,6 @@
 """What can be simulated, behind one interface: a procedural scene, or a folder of textured meshes."""
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -87,8 +88,25 @@ class SimulatedRoom:
     step_m, depth_scale_m, sky = ROOM.step_m, ROOM.depth_scale_m, ROOM.sky
 
     def __init__(self, seed: int, atlas: bake.Atlas | None = None) -> None:
+        """Initialize; the scene is painted while this goes on.
+
+        Args:
+            seed: of the scene.
+            atlas: its colors, if they are known.
+        """
         self.scene = build("room", seed)
-        self.atlas = bake.bake(self.scene, ROOM.texel_m) if atlas is None else atlas
+        self._baked: Future[bake.Atlas] = Future()
+        if atlas is not None:
+            self._baked.set_result(atlas)
+            return
+        painter = ThreadPoolExecutor(1)
+        self._baked = painter.submit(bake.bake, self.scene, ROOM.texel_m)
+        painter.shutdown(wait=False)
+
+    @property
+    def atlas(self) -> bake.Atlas:
+        """Colors of all surfaces."""
+        return self._baked.result()
 
     def store(self, folder: Path) -> RoomOnDisk:
         for k, level in enumerate(self.atlas.levels):

@@ -121,6 +121,7 @@ def simulate(
             force=force,
         ) as recording,
         tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache,
+        RenderPool(workers) as pool,
     ):
         simulated = set_up(
             scene, parameters.get("up", ""), seed, Path(cache), as_meshes=settings.needs_triangles
@@ -128,24 +129,21 @@ def simulate(
         team = _Team(settings, simulated, camera_of(size), paths)
         figures = _movers(settings, simulated, team.trajectories, Path(cache))
         frame_settings = FrameSettings.of(settings, team.camera, figures, team.rig)
-        with RenderPool(simulated, frame_settings, workers) as pool:
-            jobs = team.jobs()
-            images = pool.images(jobs)  # begun; what follows is done meanwhile
-            shared = team.report_paths(recording)
-            points = simulated.points()
-            recording.add_geometry(lambda path: write_points(path, *points))
-            title = (
-                f"{parameters['scene']}, {paradigm}, seed {seed}: neighbors share {shared:.2f} of the view"
-            )
-            sheet = Preview(
-                title,
-                team.names,
-                team.trajectories,
-                [mover.poses for mover in figures],
-                kept=team.kept_frames,
-            )
-            team.report_sensors(recording)
-            team.write(recording, track(images, "simulate", len(jobs)), sheet)
+        jobs = team.jobs()
+        images = pool.images(simulated, frame_settings, jobs)  # begun; what follows is done meanwhile
+        shared = team.report_paths(recording)
+        points = simulated.points()
+        recording.add_geometry(lambda path: write_points(path, *points))
+        title = f"{parameters['scene']}, {paradigm}, seed {seed}: neighbors share {shared:.2f} of the view"
+        sheet = Preview(
+            title,
+            team.names,
+            team.trajectories,
+            [mover.poses for mover in figures],
+            kept=team.kept_frames,
+        )
+        team.report_sensors(recording)
+        team.write(recording, track(images, "simulate", len(jobs)), sheet)
         if preview is not None:
             sheet.write(preview, points[0], points[2])
 
