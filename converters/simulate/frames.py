@@ -29,7 +29,7 @@ from duagc.converters.simulate.sensors.rig import BASELINE_M, MovingCamera, Rig,
 from duagc.converters.simulate.settings import Cover, SimulationSettings
 from duagc.converters.simulate.simulated_scenes import SimulatedScene
 from duagc.pipeline.base import determinism, random_streams
-from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.base.workers import start_now, worker_pool
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 PNG_LEVEL = 1
@@ -295,8 +295,7 @@ class RenderPool:
             prefix = "duagc-atlas-"
             self._folder = Path(self._open.enter_context(tempfile.TemporaryDirectory(prefix=prefix)))
             self._pool = self._open.enter_context(worker_pool(self.workers, determinism.configure_opencv))
-            for _ in range(self.workers):
-                self._pool.submit(_begin)
+            start_now(self._pool, self.workers)
         return self
 
     def images(
@@ -329,10 +328,6 @@ class RenderPool:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._open.__exit__(kind, error, trace)
-
-
-def _begin() -> None:
-    """Nothing: that a worker process is asked for it makes it start."""
 
 
 @cache

@@ -69,8 +69,30 @@ def worker_pool(
     pool.shutdown()
 
 
+def start_now(pool: ProcessPoolExecutor, workers: int) -> None:
+    """Start the processes of a pool before there is work for them, so that they import meanwhile.
+
+    Ctrl-C waits until they are started, and does not reach them before they leave it to their parent.
+
+    Args:
+        pool: of `worker_pool`.
+        workers: how many it has.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        for _ in range(workers):
+            pool.submit(_nothing)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _nothing() -> None:
+    """That a process is asked for it makes it start."""
+
+
 def _begin(handed_down: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=end_with_parent, daemon=True).start()
     # what it is of is imported here, and not before Ctrl-C is the parent's
     for learn, known in pickle.loads(handed_down):
