@@ -38,6 +38,8 @@ from duagc.pipeline.registration.features import Features
 
 Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
 CONVERGED = 1e-4  # m, rad: Gauss-Newton steps shrink fast, what is left after such a one is far smaller
+EXCLUDED_SIGMAS = 20.0  # by tracking, which is several of them off at times
+HARDLY = 0.1
 UNUSABLE = (Outcome.LOW_OVERLAP, Outcome.RESIDUAL)  # weak directions carry no information and do no harm
 
 
@@ -83,7 +85,7 @@ def optimize(
         views: of the k keyframes.
         images: reads the images of a keyframe.
         tracked: registrations that connect the keyframes, and loop closures; they are factors where the
-            images of a pair cannot be compared.
+            images of a pair cannot be compared, or no longer determine what tracking had determined.
         config: numbers of rounds and neighbors.
         registration: settings of the costs.
         checkpoints: of the stage.
@@ -94,6 +96,26 @@ def optimize(
     """
     neighborhood = Neighborhood(views, config)
     costs = _Costs(views, images, tracked, config=config, registration=registration)
+    rounds = partial(
+        _rounds, T_map_keyframes, neighborhood, costs, tracked, config=config, checkpoints=checkpoints
+    )
+    solution, factors = rounds(part=part)
+    if costs.hold_strayed():
+        solution, factors = rounds(part=f"{part}.held")
+    return solution, factors
+
+
+def _rounds(
+    T_map_keyframes: Array,
+    neighborhood: Neighborhood,
+    costs: _Costs,
+    tracked: Sequence[RelativePose],
+    *,
+    config: KeyframeConfig,
+    checkpoints: Checkpoints,
+    part: str,
+) -> tuple[OptimizedKeyframes, list[RelativePose]]:
+    """Expand costs and solve, in turn, from a start."""
     solution = solve_pose_graph(T_map_keyframes, tracked, config.huber_sigmas)
     coarse_rounds = config.coarse_rounds if _is_far(T_map_keyframes, tracked, config.coarse_from) else 0
     factors = list(tracked)
@@ -150,13 +172,14 @@ class _Costs:
         self._images = images
         self._min_overlap = 0.8 * config.optimization_overlap
         self._tracked = {(pair.i, pair.j): pair for pair in tracked}
+        self._held: set[Ends] = set()
         self._found: dict[Ends, RelativePose | None] = {}  # None: the images cannot be compared
         self._where: dict[Ends, tuple[Array, int]] = {}  # motion and level of the last expansion
         self._exposures: dict[Ends, tuple[float, float]] = {}  # of (reference, target)
 
     def expanded(self) -> tuple[Any, ...]:
         """All that was expanded; `go_on` takes it."""
-        return self._found, self._where, self._exposures
+        return self._found, self._where, self._exposures, self._held
 
     def go_on(self, expanded: tuple[Any, ...]) -> None:
         """Go on from what was expanded before.
@@ -164,7 +187,7 @@ class _Costs:
         Args:
             expanded: by other costs of the same keyframes.
         """
-        self._found, self._where, self._exposures = expanded
+        self._found, self._where, self._exposures, self._held = expanded
 
     def factors(self, ends: Sequence[Ends]) -> list[RelativePose]:
         """The quadratics of pairs; of one that cannot be compared, the registration of tracking, if there is one.
@@ -172,8 +195,17 @@ class _Costs:
         Args:
             ends: indices of the keyframes of every pair.
         """
-        found = (self._found.get(pair) or self._tracked.get(pair) for pair in ends)
+        known = ({} if pair in self._held else self._found for pair in ends)
+        found = (of.get(pair) or self._tracked.get(pair) for of, pair in zip(known, ends, strict=True))
         return [factor for factor in found if factor is not None]
+
+    def hold_strayed(self) -> bool:
+        """Keep to tracking, from now on, in pairs that have strayed from it; whether there are any."""
+        for pair, tracked in self._tracked.items():
+            found = self._found.get(pair)
+            if found is not None and strayed(found, tracked):
+                self._held.add(pair)
+        return len(self._held) > 0
 
     def expand(self, ends: Sequence[Ends], T: Array, level: int = 0) -> None:
         """Expand the costs of pairs at the poses T, on an image level, unless that was done there before.
@@ -249,6 +281,20 @@ def _factor(
     information, force = 0.5 * (information + information.T) / count, force / count
     step = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ force
     return RelativePose(*ends, T_first_second @ se3.exp(step), information)
+
+
+def strayed(found: RelativePose, tracked: RelativePose) -> bool:
+    """Whether tracking excludes where the cost of a pair has its minimum, while that cost hardly excludes tracking.
+
+    Other pairs can pull a keyframe to where it shares little with its neighbors, whose costs then resist no more.
+
+    Args:
+        found: the cost of the pair, where it was expanded.
+        tracked: the registration of the same pair by tracking.
+    """
+    away = se3.log(se3.inverse(found.T_i_j) @ tracked.T_i_j)
+    cost, cost_by_tracking = (float(away @ each.information @ away) for each in (found, tracked))
+    return cost_by_tracking > EXCLUDED_SIGMAS**2 and cost < HARDLY * cost_by_tracking
 
 
 class Neighborhood:

@@ -9,7 +9,7 @@ import pytest
 
 from duagc.pipeline.config.frontend import KeyframeConfig, LoopConfig, RelocalizationConfig
 from duagc.pipeline.frontend import bundle, loops
-from duagc.pipeline.frontend.bundle import Neighborhood, optimize
+from duagc.pipeline.frontend.bundle import Neighborhood, optimize, strayed
 from duagc.pipeline.frontend.current_frame import features_of
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pose_graph
 from duagc.pipeline.frontend.loops import find_loops
@@ -299,3 +299,20 @@ def test_a_pair_that_did_not_move_is_not_looked_at_again(noisy: Walk) -> None:
         rounds.append(len(read) / len(noisy.views))
     assert rounds[0] <= 3
     assert rounds[1] < 30
+
+
+@pytest.mark.parametrize(
+    ("away_m", "sigma_m", "far"),
+    [
+        (0.3, 0.2, True),  # 30 sigma of tracking, 1.5 of the images where the pair is now
+        (0.3, 0.01, False),  # the images say so
+        (0.1, 0.2, False),  # tracking may be as wrong
+    ],
+)
+def test_a_cost_far_from_tracking_that_does_not_resist_has_strayed(away_m, sigma_m, far):
+    def pair(T: np.ndarray, sigma: float) -> RelativePose:
+        return RelativePose(0, 1, T, np.diag([sigma**-2] * 3 + [1e6] * 3))
+
+    tracked = pair(se3.exp(np.array([0.1, 0.2, 0.3, 0.1, 0.2, 0.3])), 0.01)
+    found = pair(tracked.T_i_j @ se3.exp(np.array([away_m, 0, 0, 0, 0, 0])), sigma_m)
+    assert strayed(found, tracked) == far
