@@ -1,4 +1,4 @@
-"""A source tree whose kernels were not compiled."""
+"""A source tree whose kernels, or whose simulated room, were not compiled."""
 
 import subprocess
 import sys
@@ -8,7 +8,7 @@ import sys
 
 class Blocker:
     def find_spec(self, name, path=None, target=None):
-        if name == "duagc.pipeline.kernels._raster":
+        if name in ("duagc.pipeline.kernels._raster", "duagc.converters.simulate.render._flat_surfaces"):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, Blocker())
@@ -32,3 +32,13 @@ def test_the_command_makes_one_line_of_it() -> None:
     assert found.returncode == 1
     (line,) = found.stderr.splitlines()
     assert line.startswith("duagc: the compiled kernels: No module named")
+
+
+def test_so_it_is_with_the_simulated_room() -> None:
+    found = python(
+        "sys.argv = ['duagc', 'simulate', '--out', 'x']\nfrom duagc.pipeline.cli import main\nmain()"
+    )
+    assert found.returncode == 1
+    (line,) = found.stderr.splitlines()
+    assert line.startswith("duagc: the compiled room: ")
+    assert "make setup" in line

@@ -16,11 +16,18 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from duagc.converters.simulate.render import _flat_surfaces
 from duagc.converters.simulate.render.bake import Atlas
 from duagc.converters.simulate.scenes.scene import Ball, Flat, Scene, Side, Surface
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
+
+try:
+    from duagc.converters.simulate.render import _flat_surfaces
+except ImportError as error:
+    raise ImportError(
+        f"the compiled room: {error}, expected the module that `make setup` or `pip install .` builds",
+        name="duagc.converters.simulate.render._flat_surfaces",
+    ) from error
 
 NEAR_M = 0.05
 EDGE_TOLERANCE_M = 1e-9  # rays that pass exactly between two faces of a box hit one of them
