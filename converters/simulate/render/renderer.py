@@ -121,13 +121,17 @@ class Renderer:
             left[:] = 1
             self._color_others(pose, surface, left, image)
             return image
-        of_scene = pose.linear, self.extent, self.kind, self.atlas.origin
+        of_scene = self.isa, pose.linear, self.extent, self.kind, self.atlas.origin
         levels, scale = self.atlas.levels, 1 / self.atlas.texel_m
-        _flat_surfaces.colors(self.isa, *of_scene, surface, levels[0], scale, image, step2, left)
+        _flat_surfaces.colors(
+            *of_scene, seen=surface, texels=levels[0], scale=scale, color=image, step2=step2, left=left
+        )
         far = np.flatnonzero(step2 > FINEST_STEP2)
         if far.size:
             level = self._level(step2.ravel()[far])
-            _flat_surfaces.colors_between(self.isa, *of_scene, surface, levels, scale, far, level, image)
+            _flat_surfaces.colors_between(
+                *of_scene, seen=surface, texels=levels, scale=scale, pixels=far, level=level, color=image
+            )
         if left.any():
             self._color_others(pose, surface, left, image)
         return image
@@ -158,7 +162,8 @@ class Renderer:
         surface = np.full(nearest.shape, -1, dtype=np.int16)
         order, windows = pose.flat_windows()
         isa = "auto" if self.isa == "numpy" else self.isa
-        _flat_surfaces.nearest(isa, pose.linear, self.extent, self.kind, order, windows, nearest, surface)
+        of_scene = isa, pose.linear, self.extent, self.kind
+        _flat_surfaces.nearest(*of_scene, order=order, windows=windows, nearest=nearest, seen=surface)
         u, v = self.u, self.v[:, None]
         for k, (u0, v0, u1, v1) in pose.curved_windows():
             win = (slice(v0, v1), slice(u0, u1))

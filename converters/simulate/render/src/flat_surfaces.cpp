@@ -104,7 +104,7 @@ NB_MODULE(_flat_surfaces, m) {
             const int k = order.data()[i];
             build.nearest(surfaces[k], static_cast<int16_t>(k), windows.data() + 4 * i, static_cast<std::ptrdiff_t>(seen.shape(1)), nearest.data(), seen.data());
         }
-    });
+    }, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "order"_a, "windows"_a, "nearest"_a, "seen"_a);
     // color [h, w, 3]; step2 [h, w]: squared distance (texels) of samples where one flat surface fills a pixel, which is not drawn
     // where that is above FINEST_STEP2; left [h, w]: pixels that are not drawn since curved surfaces are in them.
     m.def("colors", [](const std::string& isa, const Array<const double>& linear, const Array<const double>& extent, const Array<const uint8_t>& kind, const Array<const double>& origin,
@@ -115,7 +115,7 @@ NB_MODULE(_flat_surfaces, m) {
         const nb::gil_scoped_release unlocked;
         build.colors(surfaces, seen.data(), static_cast<int>(seen.shape(1)), static_cast<int>(seen.shape(0)),
                     Texels(texels), scale, color.data(), step2.data(), left.data());
-    });
+    }, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "origin"_a, "seen"_a, "texels"_a, "scale"_a, "color"_a, "step2"_a, "left"_a);
     // pixels, level [n]: pixels that one flat surface fills, and the levels to draw them with, below the last one.
     m.def("colors_between", [](const std::string& isa, const Array<const double>& linear, const Array<const double>& extent, const Array<const uint8_t>& kind,
                                const Array<const double>& origin, const Array<const int16_t>& seen, const std::vector<Array<const uint8_t>>& texels, double scale,
@@ -131,5 +131,5 @@ NB_MODULE(_flat_surfaces, m) {
             build.between(surfaces[seen.data()[pixel]], levels.data(), level.data()[i], scale, static_cast<double>(pixel % width),
                          static_cast<double>(pixel / width), color.data() + 3 * pixel);
         }
-    });
+    }, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "origin"_a, "seen"_a, "texels"_a, "scale"_a, "pixels"_a, "level"_a, "color"_a);
 }
