@@ -88,7 +88,7 @@ class SimulatedRoom:
     step_m, depth_scale_m, sky = ROOM.step_m, ROOM.depth_scale_m, ROOM.sky
 
     def __init__(self, seed: int, atlas: bake.Atlas | None = None) -> None:
-        """Initialize; the scene is painted while this goes on.
+        """Initialize; a thread paints the scene meanwhile.
 
         Args:
             seed: of the scene.

@@ -44,7 +44,8 @@ struct Surfaces {
     enum Kind : uint8_t { RECTANGLE, DISC, CURVED };
     bool flat(int k) const { return kind[k] != CURVED; }
     Surface operator[](int k) const {
-        return {reinterpret_cast<const double (*)[3]>(linear + 9 * k), extent[2 * k], extent[2 * k + 1], origin[2 * k], origin[2 * k + 1], kind[k] == DISC};
+        const double *size = extent + 2 * k, *texel = origin + 2 * k;
+        return {reinterpret_cast<const double (*)[3]>(linear + 9 * k), size[0], size[1], texel[0], texel[1], kind[k] == DISC};
     }
 };
 
@@ -60,8 +61,8 @@ struct Texels {
 // The functions of one instruction set; what they do is said where the module defines them.
 struct Build {
     void (*nearest)(const Surface& surface, int16_t k, const int32_t* window, std::ptrdiff_t stride, double* nearest, int16_t* seen);
-    void (*colors)(const Surfaces& surfaces, const int16_t* seen, int width, int height, const Texels& texels, double scale, uint8_t* color, float* step2,
-                   uint8_t* left);
+    void (*colors)(const Surfaces& surfaces, const int16_t* seen, int width, int height, const Texels& texels, double scale,
+                   uint8_t* color, float* step2, uint8_t* left);
     void (*between)(const Surface& surface, const Texels* levels, float level, double scale, double u, double v, uint8_t* color);
 };
 
@@ -92,44 +93,56 @@ static const Build& build_named(const std::string& isa) {
     return portable::build;
 }
 
+using Reals = Array<const double>;
+using Bytes = Array<const uint8_t>;
+using Seen = Array<const int16_t>;
+
+static int rows(const Seen& seen) { return static_cast<int>(seen.shape(0)); }
+static int columns(const Seen& seen) { return static_cast<int>(seen.shape(1)); }
+
+// order, windows [m], [m, 4] (u0, v0, u1, v1): surfaces that may be seen. nearest, seen [h, w] are changed.
+static void nearest(const std::string& isa, const Reals& linear, const Reals& extent, const Bytes& kind, const Array<const int32_t>& order,
+                    const Array<const int32_t>& windows, const Array<double>& nearest, const Array<int16_t>& seen) {
+    const Surfaces surfaces = {linear.data(), extent.data(), extent.data(), kind.data()};  // where texels are is not asked
+    const Build& build = build_named(isa);
+    const nb::gil_scoped_release unlocked;
+    for (size_t i = 0; i < order.size(); i++) {
+        const int k = order.data()[i];
+        build.nearest(surfaces[k], static_cast<int16_t>(k), windows.data() + 4 * i, static_cast<std::ptrdiff_t>(seen.shape(1)),
+                      nearest.data(), seen.data());
+    }
+}
+
+// color [h, w, 3]; step2 [h, w]: squared distance (texels) of samples where one flat surface fills a pixel, which is not drawn
+// where that is above FINEST_STEP2; left [h, w]: pixels that are not drawn since curved surfaces are in them.
+static void colors(const std::string& isa, const Reals& linear, const Reals& extent, const Bytes& kind, const Reals& origin, const Seen& seen,
+                   const Bytes& texels, double scale, const Array<uint8_t>& color, const Array<float>& step2, const Array<uint8_t>& left) {
+    const Surfaces surfaces = {linear.data(), extent.data(), origin.data(), kind.data()};
+    const Build& build = build_named(isa);
+    const nb::gil_scoped_release unlocked;
+    build.colors(surfaces, seen.data(), columns(seen), rows(seen), Texels(texels), scale, color.data(), step2.data(), left.data());
+}
+
+// pixels, level [n]: pixels that one flat surface fills, and the levels to draw them with, below the last one.
+static void colors_between(const std::string& isa, const Reals& linear, const Reals& extent, const Bytes& kind, const Reals& origin,
+                           const Seen& seen, const std::vector<Bytes>& texels, double scale, const Array<const int64_t>& pixels,
+                           const Array<const float>& level, const Array<uint8_t>& color) {
+    const Surfaces surfaces = {linear.data(), extent.data(), origin.data(), kind.data()};
+    const std::vector<Texels> levels(texels.begin(), texels.end());
+    const Build& build = build_named(isa);
+    const nb::gil_scoped_release unlocked;
+    for (size_t i = 0; i < pixels.size(); i++) {
+        const int64_t pixel = pixels.data()[i];
+        build.between(surfaces[seen.data()[pixel]], levels.data(), level.data()[i], scale, static_cast<double>(pixel % columns(seen)),
+                      static_cast<double>(pixel / columns(seen)), color.data() + 3 * pixel);
+    }
+}
+
 // isa: "auto", "fused" or "portable", which give the same bits.
 NB_MODULE(_flat_surfaces, m) {
-    // order, windows [m], [m, 4] (u0, v0, u1, v1): surfaces that may be seen. nearest, seen [h, w] are changed.
-    m.def("nearest", [](const std::string& isa, const Array<const double>& linear, const Array<const double>& extent, const Array<const uint8_t>& kind,
-                        const Array<const int32_t>& order, const Array<const int32_t>& windows, const Array<double>& nearest, const Array<int16_t>& seen) {
-        const Surfaces surfaces = {linear.data(), extent.data(), extent.data(), kind.data()};  // where texels are is not asked
-        const Build& build = build_named(isa);
-        const nb::gil_scoped_release unlocked;
-        for (size_t i = 0; i < order.size(); i++) {
-            const int k = order.data()[i];
-            build.nearest(surfaces[k], static_cast<int16_t>(k), windows.data() + 4 * i, static_cast<std::ptrdiff_t>(seen.shape(1)), nearest.data(), seen.data());
-        }
-    }, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "order"_a, "windows"_a, "nearest"_a, "seen"_a);
-    // color [h, w, 3]; step2 [h, w]: squared distance (texels) of samples where one flat surface fills a pixel, which is not drawn
-    // where that is above FINEST_STEP2; left [h, w]: pixels that are not drawn since curved surfaces are in them.
-    m.def("colors", [](const std::string& isa, const Array<const double>& linear, const Array<const double>& extent, const Array<const uint8_t>& kind, const Array<const double>& origin,
-                       const Array<const int16_t>& seen, const Array<const uint8_t>& texels, double scale, const Array<uint8_t>& color, const Array<float>& step2,
-                       const Array<uint8_t>& left) {
-        const Surfaces surfaces = {linear.data(), extent.data(), origin.data(), kind.data()};
-        const Build& build = build_named(isa);
-        const nb::gil_scoped_release unlocked;
-        build.colors(surfaces, seen.data(), static_cast<int>(seen.shape(1)), static_cast<int>(seen.shape(0)),
-                    Texels(texels), scale, color.data(), step2.data(), left.data());
-    }, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "origin"_a, "seen"_a, "texels"_a, "scale"_a, "color"_a, "step2"_a, "left"_a);
-    // pixels, level [n]: pixels that one flat surface fills, and the levels to draw them with, below the last one.
-    m.def("colors_between", [](const std::string& isa, const Array<const double>& linear, const Array<const double>& extent, const Array<const uint8_t>& kind,
-                               const Array<const double>& origin, const Array<const int16_t>& seen, const std::vector<Array<const uint8_t>>& texels, double scale,
-                               const Array<const int64_t>& pixels, const Array<const float>& level, const Array<uint8_t>& color) {
-        const Surfaces surfaces = {linear.data(), extent.data(), origin.data(), kind.data()};
-        std::vector<Texels> levels;
-        for (const auto& each : texels) levels.emplace_back(each);
-        const auto width = static_cast<int64_t>(seen.shape(1));
-        const Build& build = build_named(isa);
-        const nb::gil_scoped_release unlocked;
-        for (size_t i = 0; i < pixels.size(); i++) {
-            const int64_t pixel = pixels.data()[i];
-            build.between(surfaces[seen.data()[pixel]], levels.data(), level.data()[i], scale, static_cast<double>(pixel % width),
-                         static_cast<double>(pixel / width), color.data() + 3 * pixel);
-        }
-    }, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "origin"_a, "seen"_a, "texels"_a, "scale"_a, "pixels"_a, "level"_a, "color"_a);
+    m.def("nearest", &nearest, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "order"_a, "windows"_a, "nearest"_a, "seen"_a);
+    m.def("colors", &colors, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "origin"_a, "seen"_a, "texels"_a, "scale"_a, "color"_a, "step2"_a,
+          "left"_a);
+    m.def("colors_between", &colors_between, "isa"_a, "linear"_a, "extent"_a, "kind"_a, "origin"_a, "seen"_a, "texels"_a, "scale"_a,
+          "pixels"_a, "level"_a, "color"_a);
 }

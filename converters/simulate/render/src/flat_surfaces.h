@@ -30,7 +30,9 @@ inline Four four(const uint8_t* texel) {
 inline Four fused(float a, Four b, Four c) { return _mm_fmadd_ps(_mm_set1_ps(a), b, c); }
 inline Four rounded(Four a) { return _mm_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 #else
-inline Four four(const uint8_t* texel) { return Four{static_cast<float>(texel[0]), static_cast<float>(texel[1]), static_cast<float>(texel[2]), 0.0f}; }
+inline Four four(const uint8_t* texel) {
+    return Four{static_cast<float>(texel[0]), static_cast<float>(texel[1]), static_cast<float>(texel[2]), 0.0f};
+}
 inline Four fused(float a, Four b, Four c) {
     return Four{std::fmaf(a, b[0], c[0]), std::fmaf(a, b[1], c[1]), std::fmaf(a, b[2], c[2]), 0.0f};
 }
@@ -70,7 +72,8 @@ inline void write(Four color, uint8_t* out) {
 }
 
 template <bool DISC>
-inline void nearest_in_window(const Surface& surface, int16_t k, const int32_t* window, std::ptrdiff_t stride, double* nearest, int16_t* seen) {
+inline void nearest_in_window(const Surface& surface, int16_t k, const int32_t* window, std::ptrdiff_t stride, double* nearest,
+                              int16_t* seen) {
     const int u0 = window[0], v0 = window[1], u1 = window[2], v1 = window[3];
     const double(*const c)[3] = surface.linear;
     for (int v = v0; v < v1; v++) {
@@ -148,7 +151,8 @@ struct Hits {
 };
 
 // The color of a pixel next to a border: of what each of its samples hits among the surfaces around, which are sorted.
-inline void draw_border(const Surfaces& surfaces, const int16_t* around, int count, const Texels& texels, double scale, double u, double v, uint8_t* color) {
+inline void draw_border(const Surfaces& surfaces, const int16_t* around, int count, const Texels& texels, double scale, double u,
+                        double v, uint8_t* color) {
     Hits hits;
     for (int i = 0; i < count; i++) {
         const Surface surface = surfaces[around[i]];
@@ -196,7 +200,8 @@ inline bool alike(const int16_t* seen, int width, int height, int u, int v) {
     return same;
 }
 
-static void draw_colors(const Surfaces& surfaces, const int16_t* seen, int width, int height, const Texels& texels, double scale, uint8_t* color, float* step2, uint8_t* left) {
+static void draw_colors(const Surfaces& surfaces, const int16_t* seen, int width, int height, const Texels& texels, double scale,
+                        uint8_t* color, float* step2, uint8_t* left) {
     for (int v = 0; v < height; v++)
         for (int u = 0; u < width; u++) {
             const std::ptrdiff_t pixel = static_cast<std::ptrdiff_t>(v) * width + u;
