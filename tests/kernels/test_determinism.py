@@ -18,6 +18,7 @@ SURFACE = LossWeights(**{**vars(LOSS), "surface_weight": 0.3})
 CALLS = [(isa, threads) for isa in available_isas() for threads in (1, 2, 3, 5)]
 QUICK = [call for call in CALLS if call[0] != "portable" or call[1] in (1, 3)]  # it imitates fma, at length
 FAST = [call for call in QUICK if call[0] != "portable"] or QUICK[:1]
+SLOW = [pytest.param(*call, marks=pytest.mark.slow) for call in CALLS if call not in QUICK]
 PORTABLE = [call for call in QUICK if call not in FAST]
 MANY, FEW = 3000, 1000  # Gaussians: in the slow tests, and in `make test`
 
@@ -107,7 +108,7 @@ def test_one_digest_while_the_number_of_threads_changes():
     assert threads.calls >= 3
 
 
-@pytest.mark.parametrize(("isa", "threads"), CALLS)
+@pytest.mark.parametrize(("isa", "threads"), [*QUICK, *SLOW])
 def test_one_digest_of_many_gaussians(isa, threads):
     assert digest(Rasterizer(isa, threads), MANY) == one_digest(MANY)
 
