@@ -95,13 +95,14 @@ class SimulatedRoom:
             atlas: its colors, if they are known.
         """
         self.scene = build("room", seed)
-        self._baked: Future[bake.Atlas] = Future()
-        if atlas is not None:
+        self._baked: Future[bake.Atlas]
+        if atlas is None:
+            painter = ThreadPoolExecutor(1)
+            self._baked = painter.submit(bake.bake, self.scene, ROOM.texel_m)
+            painter.shutdown(wait=False)
+        else:
+            self._baked = Future()
             self._baked.set_result(atlas)
-            return
-        painter = ThreadPoolExecutor(1)
-        self._baked = painter.submit(bake.bake, self.scene, ROOM.texel_m)
-        painter.shutdown(wait=False)
 
     @property
     def atlas(self) -> bake.Atlas:

@@ -39,7 +39,7 @@ from duagc.pipeline.registration.features import Features
 Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
 CONVERGED = 1e-4  # m, rad: Gauss-Newton steps shrink fast, what is left after such a one is far smaller
 EXCLUDED_SIGMAS = 20.0  # by tracking, which is several of them off at times
-HARDLY = 0.1
+HARDLY = 0.1  # of what tracking excludes by
 UNUSABLE = (Outcome.LOW_OVERLAP, Outcome.RESIDUAL)  # weak directions carry no information and do no harm
 
 
@@ -73,6 +73,7 @@ def optimize(
     images: Images,
     tracked: Sequence[RelativePose],
     *,
+    closures: Sequence[RelativePose] = (),
     config: KeyframeConfig,
     registration: RegistrationConfig,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
@@ -84,8 +85,9 @@ def optimize(
         T_map_keyframes: [k, 4, 4], start.
         views: of the k keyframes.
         images: reads the images of a keyframe.
-        tracked: registrations that connect the keyframes, and loop closures; they are factors where the
-            images of a pair cannot be compared, or no longer determine what tracking had determined.
+        tracked: registrations that connect the keyframes; they are factors where the images of a pair cannot be
+            compared, or no longer determine what tracking had determined.
+        closures: loop closures; factors where the images of a pair cannot be compared.
         config: numbers of rounds and neighbors.
         registration: settings of the costs.
         checkpoints: of the stage.
@@ -94,13 +96,13 @@ def optimize(
     Returns:
         The poses, and one factor per pair of keyframes: sum of factors = the joint cost at the answer, to second order.
     """
-    neighborhood = Neighborhood(views, config)
-    costs = _Costs(views, images, tracked, config=config, registration=registration)
+    neighborhood, known = Neighborhood(views, config), [*tracked, *closures]
+    costs = _Costs(views, images, known, config=config, registration=registration)
     rounds = partial(
-        _rounds, T_map_keyframes, neighborhood, costs, tracked, config=config, checkpoints=checkpoints
+        _rounds, T_map_keyframes, neighborhood, costs, known, config=config, checkpoints=checkpoints
     )
     solution, factors = rounds(part=part)
-    if costs.hold_strayed():
+    if costs.hold_strayed(tracked):
         solution, factors = rounds(part=f"{part}.held")
     return solution, factors
 
@@ -172,7 +174,7 @@ class _Costs:
         self._images = images
         self._min_overlap = 0.8 * config.optimization_overlap
         self._tracked = {(pair.i, pair.j): pair for pair in tracked}
-        self._held: set[Ends] = set()
+        self._held: set[Ends] = set()  # pairs that keep to tracking
         self._found: dict[Ends, RelativePose | None] = {}  # None: the images cannot be compared
         self._where: dict[Ends, tuple[Array, int]] = {}  # motion and level of the last expansion
         self._exposures: dict[Ends, tuple[float, float]] = {}  # of (reference, target)
@@ -199,12 +201,16 @@ class _Costs:
         found = (of.get(pair) or self._tracked.get(pair) for of, pair in zip(known, ends, strict=True))
         return [factor for factor in found if factor is not None]
 
-    def hold_strayed(self) -> bool:
-        """Keep to tracking, from now on, in pairs that have strayed from it; whether there are any."""
-        for pair, tracked in self._tracked.items():
-            found = self._found.get(pair)
-            if found is not None and strayed(found, tracked):
-                self._held.add(pair)
+    def hold_strayed(self, tracked: Sequence[RelativePose]) -> bool:
+        """Keep to tracking, from now on, in pairs that have strayed from it; whether there are any.
+
+        Args:
+            tracked: registrations by tracking.
+        """
+        for pair in tracked:
+            found = self._found.get((pair.i, pair.j))
+            if found is not None and strayed(found, pair):
+                self._held.add((pair.i, pair.j))
         return len(self._held) > 0
 
     def expand(self, ends: Sequence[Ends], T: Array, level: int = 0) -> None:

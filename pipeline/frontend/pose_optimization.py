@@ -154,6 +154,7 @@ class PathOptimization:
         def images(index: int, levels: int) -> RgbdPyramid:
             return self.images(keyframes[index].frame_index, levels)
 
+        closures: Sequence[RelativePose] = ()
         if settings.loops.enabled:
             tracked = solve_pose_graph(start, pairs, settings.huber_sigmas).T_map_keyframe
             found = self.checkpoints.done(
@@ -170,14 +171,16 @@ class PathOptimization:
                     part=f"{part}.loops",
                 ),
             )
-            pairs = [*pairs, *consistent_loops(tracked, pairs, found, settings.loops)]
+            closures = consistent_loops(tracked, pairs, found, settings.loops)
         if not settings.local_optimization:
-            return solve_pose_graph(start, pairs, settings.huber_sigmas), pairs
+            known = [*pairs, *closures]
+            return solve_pose_graph(start, known, settings.huber_sigmas), known
         return bundle.optimize(
             start,
             keyframes,
             images,
             pairs,
+            closures=closures,
             config=settings,
             registration=registration,
             checkpoints=self.checkpoints,

@@ -60,7 +60,8 @@ class PeerCheck:
         own_px: all own pixels.
         color_mse: mean squared error of the map's colors on the compared pixels, colors 0..1.
         color_variance: of the own colors there, at least `PeerValidationConfig.min_color_variance`.
-        trusted: whether the map explains own images, or too few pixels see it to decide.
+        trusted: whether the map explains own images, or blocks of them correlate with it, or too few pixels see it to
+            decide.
         matches: of the peer with this robot.
         rejected_matches: of them, found to be false.
     """

@@ -73,7 +73,7 @@ class PhotometricCheck:
         self.num_contradicted = 0
 
     def trusted(self, own_px: int) -> bool:
-        """Whether the map explains own images, or too few of all own pixels see it to decide.
+        """Whether the map explains own images, or blocks of them correlate with it, or too few own pixels see it.
 
         Of a map with holes as much is expected as there is of it; what is wrong explains nothing, however little it is.
         """

@@ -301,6 +301,31 @@ def test_a_pair_that_did_not_move_is_not_looked_at_again(noisy: Walk) -> None:
     assert rounds[1] < 30
 
 
+def test_a_pair_that_has_strayed_keeps_to_tracking_and_a_loop_closure_does_not(
+    noisy: Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, *others = noisy.pairs
+    closure = others.pop()
+
+    def factors() -> list[RelativePose]:
+        return optimize(
+            noisy.chained(noisy.pairs),
+            noisy.views,
+            noisy.images,
+            [first, *others],
+            closures=[closure],
+            config=CONFIG,
+            registration=REGISTRATION,
+        )[1]
+
+    assert not any(factor is first for factor in factors())
+    monkeypatch.setattr(bundle, "strayed", lambda found, tracked: tracked is first or tracked is closure)
+    held = factors()
+    assert any(factor is first for factor in held)
+    assert not any(factor is closure for factor in held)
+    assert len({(factor.i, factor.j) for factor in held}) == len(held)
+
+
 @pytest.mark.parametrize(
     ("away_m", "sigma_m", "far"),
     [
