@@ -39,7 +39,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.atomic_folder import check_apart
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.base.files import decode_image, encode_png
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
@@ -285,7 +285,7 @@ def _measured(
         image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise UnusableImage(f"{where}: no decoder reads it, expected a color image")
-        data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
+        data = encode_png(np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR)))
         color_format = "png"
     if depth is None:
         return Picture(data, color_format), 0

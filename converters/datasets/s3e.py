@@ -29,7 +29,6 @@ from duagc.converters.layouts.derived_depth import (
     decoded,
     gyro,
     imu_readings,
-    png,
     spread,
 )
 from duagc.converters.layouts.image_files import options_of
@@ -45,7 +44,7 @@ from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import encode_png, read_text
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3, so3
 
@@ -364,7 +363,7 @@ class _Vehicle:
                 color = self.rig.rectify_left(
                     self.frames.sized(decoded(parts[self.left].read(), self.where), self.where)
                 )
-                robot.add_frame(stamp, png(color), "png", None, T_world_camera=self.truth.get(stamp))
+                robot.add_frame(stamp, encode_png(color), "png", None, T_world_camera=self.truth.get(stamp))
                 continue
             image, depth, sigma_m = self.frames.frame(
                 parts[self.left].read(), parts[self.right].read(), self.where

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.files import encode_png
 from duagc.pipeline.geometry import depth_error, se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
@@ -91,7 +92,7 @@ def resampled(image: NDArray[np.uint8], maps: tuple[NDArray[np.float32], NDArray
     import cv2
 
     moved = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return cv2.imencode(".png", moved)[1].tobytes()
+    return encode_png(np.asarray(moved))
 
 
 def correct(depth_m: Array, camera: PinholeCamera, coefficients: Numbers) -> Array:

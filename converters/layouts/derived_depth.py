@@ -16,7 +16,7 @@ from duagc.converters.logs.entries import Entry
 from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.base.files import decode_image, encode_png
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.motion import GyroPrior, MotionPrior
 
@@ -60,13 +60,6 @@ def decoded(message: Any, where: str) -> Image:
     return np.asarray(image, dtype=np.uint8)
 
 
-def png(image: Image) -> bytes:
-    """A BGR image as PNG, lightly compressed."""
-    import cv2
-
-    return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
-
-
 class StereoFrames:
     """Rectified color, depth and sigma of the pairs of one rig."""
 
@@ -102,7 +95,11 @@ class StereoFrames:
         color, other = self.rectified(left, right, where)
         depth_m, sigma_m = self.rig.depth(gray(color), gray(other))
         units = np.rint(depth_m / STEREO_SCALE_M)
-        return png(color), np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16), sigma_m
+        return (
+            encode_png(color),
+            np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16),
+            sigma_m,
+        )
 
 
 def gray(image: Image) -> Image:

@@ -25,6 +25,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import encode_png
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.base import Config
@@ -293,7 +294,7 @@ class _Lens:
         if self._maps is None:
             return kept_color(path, self._size)
         moved = cv2.remap(read_color(path, self._size), *self._maps, cv2.INTER_LINEAR)
-        return cv2.imencode(".png", moved)[1].tobytes(), "png"
+        return encode_png(np.asarray(moved)), "png"
 
 
 def _maps(

@@ -10,10 +10,9 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.base.files import decode_image, encode_png
 
 Depth = NDArray[np.float32]
-PNG_LEVEL = 1
 _COLOR_CODES = {  # encoding: channels, and the name of OpenCV's conversion to BGR
     "rgb8": (3, "COLOR_RGB2BGR"),
     "bgr8": (3, None),
@@ -179,8 +178,7 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
         )
     if conversion is not None:
         pixels = cv2.cvtColor(pixels, getattr(cv2, conversion))
-    settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
-    return cv2.imencode(".png", np.ascontiguousarray(pixels), settings)[1].tobytes(), "png"
+    return encode_png(pixels), "png"
 
 
 def _whole(message: Any, where: str) -> bytes:
@@ -210,7 +208,7 @@ def _bayer_as_png(data: bytes, pattern: str, where: str) -> bytes | None:
         kind = UnusableImage if image is None else DuagError
         raise kind(f"{where}: {found} of {pattern}, expected a JPEG or PNG of one of {known}")
     colors = cv2.cvtColor(image, getattr(cv2, str(_COLOR_CODES[pattern][1])))
-    return cv2.imencode(".png", colors, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
+    return encode_png(np.asarray(colors))
 
 
 def _webp_as_png(data: bytes, where: str) -> bytes:
@@ -220,7 +218,7 @@ def _webp_as_png(data: bytes, where: str) -> bytes:
     image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise UnusableImage(f"{where}: {len(data)} bytes of WebP that no decoder reads, expected an image")
-    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
+    return encode_png(image)
 
 
 def depth_m(message: Any, where: str, scale: float) -> Depth:

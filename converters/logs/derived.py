@@ -16,7 +16,6 @@ from duagc.converters.layouts.derived_depth import (
     LidarSource,
     StereoFrames,
     decoded,
-    png,
     spread,
 )
 from duagc.converters.layouts.ros_camera import RosCamera
@@ -30,6 +29,7 @@ from duagc.converters.logs.motion import extrinsics_of
 from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import encode_png
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import Mask
@@ -121,7 +121,7 @@ class Sweeps:
         data, color_format = color_bytes(color, where)
         if self._maps is not None:
             image = cv2.remap(decoded(color, where), *self._maps, cv2.INTER_LINEAR)
-            data, color_format = png(np.asarray(image, dtype=np.uint8)), "png"
+            data, color_format = encode_png(np.asarray(image, dtype=np.uint8)), "png"
         points = self.lidar.points(partner, partner_ns, color_ns, f"{self._where[1]} at {partner_ns} ns")
         return Picture(data, color_format, points_lidar=points)
 

@@ -29,10 +29,9 @@ from duagc.converters.simulate.sensors.rig import BASELINE_M, MovingCamera, Rig,
 from duagc.converters.simulate.settings import Cover, SimulationSettings
 from duagc.converters.simulate.simulated_scenes import SimulatedScene
 from duagc.pipeline.base import determinism, random_streams
+from duagc.pipeline.base.files import encode_png
 from duagc.pipeline.base.workers import start_now, worker_pool
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-PNG_LEVEL = 1
 
 
 @dataclass(frozen=True)
@@ -186,7 +185,9 @@ class FrameRenderer:
             rng = random_streams.generator(settings.seed, "simulate.lidar", robot=job.robot, frame=job.index)
             depth, points = None, self.moving.sweep(job.T_world_camera, job.index, rng)
             exact = _units(exact_m, self.depth_scale_m)
-        return FrameImages(_png(color), depth, exact, mask=mask, sigma_m=sigma_m, points=points)
+        return FrameImages(
+            encode_png(color[..., ::-1]), depth, exact, mask=mask, sigma_m=sigma_m, points=points
+        )
 
     def _lit(self, color: NDArray[np.uint8], job: FrameJob) -> NDArray[np.uint8]:
         """The image as the camera's exposure, white balance and vignette have it."""
@@ -212,7 +213,7 @@ class FrameRenderer:
         exact_apart = settings.noise == "kinect" or settings.degradations.of_depth_or_lens
         mask = np.ones(depth.shape, dtype=np.bool_) if settings.movers else None
         return FrameImages(
-            _png(np.zeros((*depth.shape, 3), dtype=np.uint8)),
+            encode_png(np.zeros((*depth.shape, 3), dtype=np.uint8)),
             depth if of_images else None,
             depth if exact_apart else None,
             mask=mask if self.straight is None else self.straight.mask,
@@ -260,12 +261,6 @@ class _Undistortion:
     def exact_depth(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """True depth [h, w] at the pixel centers, 0 in the rim."""
         return np.where(self.mask, self._renderer.depth(T_world_camera)[0], 0.0)
-
-
-def _png(color: NDArray[np.uint8]) -> bytes:
-    settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
-    _, png = cv2.imencode(".png", np.ascontiguousarray(color[..., ::-1]), settings)
-    return png.tobytes()
 
 
 def _units(depth_m: NDArray[np.float64], scale_m: float) -> NDArray[np.uint16]:

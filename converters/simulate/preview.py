@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.files import new_file
+from duagc.pipeline.base.files import encode_png, new_file
 
 Image = NDArray[np.uint8]
 
@@ -64,9 +64,9 @@ class Preview:
         width = max(row.shape[1] for row in rows)
         sheet = [_line(self.title, width)]
         sheet += [_padded(row, width) for row in rows]
-        _, png = cv2.imencode(".png", np.ascontiguousarray(np.concatenate(sheet)[..., ::-1]))
+        png = encode_png(np.concatenate(sheet)[..., ::-1])
         with new_file(path) as part:
-            part.write_bytes(png.tobytes())
+            part.write_bytes(png)
 
     def _row(self, k: int) -> Image:
         """The frames of one robot."""

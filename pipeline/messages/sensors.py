@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from duagc import schemas
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.base.files import decode_image, encode_png
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages.parts import camera_frame, numbers, pack_array, pack_stamp, unpack_array
@@ -75,11 +75,10 @@ def unpack_mask(m: Any, where: str) -> NDArray[np.bool_]:
 
 def pack_valid(stamp_ns: int, robot: str, valid: NDArray[np.bool_]) -> Any:
     """foxglove.CompressedImage, PNG of 8 bits, of the pixels that show the scene, bool [H, W]: 255 = yes, 0 = no."""
-    import cv2
 
     if valid.dtype != np.bool_ or valid.ndim != 2:
         raise ValueError(f"mask is {valid.dtype} {valid.shape}, expected bool [H, W]")
-    data = cv2.imencode(".png", np.where(valid, np.uint8(255), np.uint8(0)))[1].tobytes()
+    data = encode_png(np.where(valid, np.uint8(255), np.uint8(0)))
     return pack_color(stamp_ns, robot, data, "png")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import new_file
+from duagc.pipeline.base.files import encode_png, new_file
 from duagc.pipeline.geometry.masks import checkered
 from duagc.pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
 
@@ -43,7 +43,6 @@ def write_preview(logs: Sequence[Path], out: Path) -> None:
         logs: of robots with a camera.
         out: must not exist.
     """
-    import cv2
 
     if out.exists():
         raise DuagError(f"{out}: exists already, expected the name of a new picture")
@@ -54,7 +53,7 @@ def write_preview(logs: Sequence[Path], out: Path) -> None:
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
     with new_file(out) as part:
-        part.write_bytes(cv2.imencode(".png", sheet[:, :, ::-1])[1].tobytes())
+        part.write_bytes(encode_png(sheet[:, :, ::-1]))
 
 
 def _rows_of(log: RgbdLog) -> list[Picture]:

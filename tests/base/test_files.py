@@ -1,11 +1,13 @@
-"""Text of files from outside."""
+"""Text of files from outside, and images in them."""
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import decode_image, encode_png, read_text
 
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"], ids=["plain", "byte order mark"])
@@ -20,3 +22,9 @@ def test_what_is_no_text_is_one_line(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe1\0")
     with pytest.raises(DuagError, match=r"list\.txt: is not text, expected a list"):
         read_text(path, "a list")
+
+
+@pytest.mark.parametrize("shape", [(12, 17), (12, 17, 3)])
+def test_png_keeps_pixels_in_whatever_order_they_lie(shape: tuple[int, ...]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)[:, ::-1]
+    assert np.array_equal(decode_image(encode_png(image), cv2.IMREAD_UNCHANGED), image)
