@@ -60,6 +60,11 @@ def wait(src: Path, out: Path) -> None:
     os.read(os.pipe()[0], 1)
 
 
+def doze(src: Path, out: Path) -> None:
+    while True:
+        time.sleep(0.005)
+
+
 def work(src: Path, out: Path) -> None:
     while True:
         pass
@@ -109,12 +114,29 @@ def test_outcomes(read: Callable[[Path, Path], None], kind: str, words: str) -> 
         assert (outcome.kind, words in outcome.text) == (kind, True), outcome.text
 
 
-@pytest.mark.parametrize(("read", "words"), [(wait, "waits"), (work, "more than 1 s")])
+@pytest.mark.parametrize(("read", "words"), [(wait, "waits"), (doze, "waits"), (work, "more than 1 s")])
 def test_hangs(read: Callable[[Path, Path], None], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.fuzz.cases.CPU_S", 1)
     monkeypatch.setattr("tests.fuzz.cases.IDLE_S", 1)
     (outcome,) = cases(fake(read), 1)
     assert (outcome.kind, words in outcome.text) == ("failed", True), outcome.text
+
+
+def test_no_lock_of_a_thread_that_reads_ahead_is_inherited() -> None:
+    lock = threading.Lock()
+
+    def hold() -> None:
+        with lock:
+            time.sleep(0.3)
+
+    def read(src: Path, out: Path) -> None:
+        if src.name == "seed":
+            threading.Thread(target=hold).start()
+        elif not lock.acquire(timeout=5.0):
+            raise ValueError("locked")
+
+    (outcome,) = cases(Reader("fake", fake(read).make, read, lambda path, rng: False), 1)
+    assert outcome.kind == "read", outcome.text
 
 
 def test_a_case_that_depends_on_those_before_it_is_named() -> None:
