@@ -49,9 +49,9 @@ class PeerRegistrationConfig(RegistrationConfig):
     gray_noise_of_depth: bool = True
     """Count the error of a sample's depth in the noise of its gray value: robots meet at wide baselines, where gray
     values are trusted too much without."""
-    min_overlap: float = 0.2
-    """Smaller overlap is LOW_OVERLAP. Less than within a robot: features have agreed before, and a robot that stands
-    nearer sees little of what the samples of its neighbor show."""
+    min_overlap: float = 0.1
+    """Smaller overlap is LOW_OVERLAP: what so few samples say is wrong by more than they state. Above, the limits of
+    `verification` decide."""
 
 
 class VerificationConfig(GeometricVerificationConfig):
@@ -75,8 +75,12 @@ class VerificationConfig(GeometricVerificationConfig):
     """Points with normal and intensity of the neighbor's keyframe used by the registration."""
     min_overlap: float = Field(default=0.2, ge=0.0, le=1.0)
     """Overlap that the registration must find, of what the own camera can see of the neighbor's samples."""
+    min_covered: float | None = Field(default=0.6, gt=0.0, le=1.0)
+    """Share of the own image in which the neighbor's samples must be seen for less overlap to be enough; None: no share
+    is."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)
-    """Largest translation by which the registration may change what RANSAC found."""
+    """Largest translation by which the registration may change what RANSAC found: of the camera or, if less, of the
+    matches that agree."""
     registration: PeerRegistrationConfig = PeerRegistrationConfig()
     """The registration itself."""
     max_refinement_rad: float = Field(default=0.10, gt=0.0)

@@ -86,13 +86,17 @@ class GeometricVerificationConfig(Config):
     """The same as a share of the matches; the larger number holds."""
     min_overlap: float = Field(default=0.3, ge=0.0, le=1.0)
     """Overlap that the registration must find."""
+    min_covered: float | None = Field(default=None, gt=0.0, le=1.0)
+    """Share of its own image in which a view must see samples of the other one for less overlap to be enough: a camera
+    that stands nearer sees few of them, and nothing else. None: no share is enough."""
     max_disagreement_m: float = Field(default=0.03, gt=0.0)
     """Largest distance between the registrations in the two directions, where both views' images are at hand. As the
     limit below, it grows with the median depth beyond 6 m."""
     max_disagreement_rad: float = Field(default=0.03, gt=0.0)
     """The same for the rotation."""
     max_refinement_m: float = Field(default=0.3, gt=0.0)
-    """Largest translation by which the registration may change what RANSAC found."""
+    """Largest translation by which the registration may change what RANSAC found: of the camera or, if less, of the
+    matches that agree."""
     max_refinement_rad: float = Field(default=0.35, gt=0.0)
     """The same for the rotation."""
 

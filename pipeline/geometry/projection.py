@@ -17,6 +17,7 @@ Image = NDArray[np.floating]
 NEAR_M = 0.05  # points nearer to the image plane are not projected: their pixels mean little
 NEAR_GATE = 0.25  # of the depth: gates in meters of near surfaces are no larger
 SAME_SURFACE = 0.1  # relative difference of depth up to which two views show the same surface
+PARTS = (4, 5)  # rows and columns of parts that `covered` counts
 BEHIND_COSINE = 0.2  # between ray and normal; beyond, a surface is seen from behind: noisy normals scatter
 
 FREE, ON_SURFACE, HIDDEN = 1, 0, -1  # where a point is as a view saw it: see `free_space`
@@ -93,8 +94,7 @@ def overlap(
     index, u, v = visible(camera, points_camera)
     z = points_camera[index, 2]
     if inverse_depth is not None:
-        measured = inverse_depth[v, u]
-        same = (measured > 0) & (np.abs(z * measured - 1) < SAME_SURFACE)
+        same = _meets(z, inverse_depth[v, u])
     elif depth_m is not None:
         same = np.abs(depth_m[v, u] - z) < SAME_SURFACE * z
     else:
@@ -102,6 +102,31 @@ def overlap(
     if normals is not None:
         same &= ~from_behind(points_camera[index], normals[index])
     return float(np.count_nonzero(same)) / len(points_camera)
+
+
+def covered(points_camera: Array, camera: PinholeCamera, inverse_depth: Image, normals: Array) -> float:
+    """Share of a view's image, by `PARTS`, in which it sees points of another one on the same surface.
+
+    A camera that stands nearer than another sees little of what that one saw, but of its own image all is in it.
+
+    Args:
+        points_camera: [n, 3], meters, samples of the other view in the frame of this one.
+        camera: of this view.
+        inverse_depth: [h, w], what this view measured, 1/m, 0 = unknown.
+        normals: [n, 3], unit length, of the points, in the frame of this view.
+    """
+    index, u, v = visible(camera, points_camera)
+    same = _meets(points_camera[index, 2], inverse_depth[v, u])
+    same &= ~from_behind(points_camera[index], normals[index])
+    rows, columns = PARTS
+    here = np.zeros(PARTS, dtype=bool)
+    here[v[same] * rows // camera.height, u[same] * columns // camera.width] = True
+    return float(here.mean())
+
+
+def _meets(z: NDArray[np.floating], inverse_depth: Image) -> NDArray[np.bool_]:
+    """Whether points at these depths lie on what was measured there, 1/m, 0 = unknown."""
+    return np.asarray((inverse_depth > 0) & (np.abs(z * inverse_depth - 1) < SAME_SURFACE))
 
 
 def from_behind(points_camera: NDArray[np.floating], normals: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -8,14 +8,14 @@ differ in their settings and in what they have of the two views.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
-from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry import projection, se3, so3
 from duagc.pipeline.registration.align import Registration, reach_factor, register
 from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.matched_points import ransac
@@ -35,12 +35,14 @@ class FeatureMotion:
         matches: number of matches.
         inliers: number of matches that agree.
         needed: inliers from which the motion is accepted; with too few matches, the matches needed.
+        points: [inliers, 3], meters, where the second view has the matches that agree.
     """
 
     T_first_second: Array | None
     matches: int
     inliers: int
     needed: int
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def accepted(self) -> bool:
@@ -93,7 +95,8 @@ class GeometricVerification:
         registration: the decisive registration; None before any.
         T_first_second: [4, 4], by the registration; identity before it.
         information: [6, 6] of its right tangent; zero before it.
-        correction_m: how far registration moved the motion that the features gave; 0 before it.
+        correction_m: how far registration moved the motion that the features gave, at the camera or at the features,
+            whichever is less; 0 before it.
         correction_rad: the same for the rotation.
     """
 
@@ -150,7 +153,7 @@ def _motion_of_points(
     T, agree = ransac(
         points_first, points_second, inlier_m=config.inlier_m, hypotheses=config.hypotheses, rng=rng
     )
-    return FeatureMotion(T, n, int(agree.sum()), _inliers_needed(n, config))
+    return FeatureMotion(T, n, int(agree.sum()), _inliers_needed(n, config), points_second[agree])
 
 
 def features_agree(
@@ -292,32 +295,53 @@ def verify(
         return failed(Failure.FEW_INLIERS)
     guess = found.T_first_second
     measured: list[tuple[Registration, Array, Array]] = []  # T_first_second and its information
+    enough = True
     if first.reference is not None and second.images is not None:
-        forward = register(first.reference, second.images(), guess, registration)
+        target = second.images()
+        forward = register(first.reference, target, guess, registration)
         measured.append((forward, forward.T_reference_target, forward.information))
+        enough = _shares_enough(forward, first.reference, target, config)
     if second.reference is not None and first.images is not None:
-        backward = register(second.reference, first.images(), se3.inverse(guess), registration)
+        target = first.images()
+        backward = register(second.reference, target, se3.inverse(guess), registration)
         T_second_first, information = backward.T_reference_target, backward.information
         turned = se3.inverse_information(T_second_first, information)
         measured.append((backward, se3.inverse(T_second_first), turned))
+        enough = enough and _shares_enough(backward, second.reference, target, config)
     if not measured:
         raise ValueError("geometric verification needs samples of one view and images of the other")
     result, T, information = measured[0]
     for one, _, _ in measured:
         if not one.ok or np.linalg.eigvalsh(one.information)[0] <= 0:
             return failed(Failure.NOT_REGISTERED, one)
-    if min(one.overlap for one, _, _ in measured) < config.min_overlap:
+    if not enough:
         return failed(Failure.LOW_OVERLAP, result)
     apart_m, apart_rad = se3.distance(T, measured[-1][1])
     reach = reach_factor(max(first.median_depth_m, second.median_depth_m))
     if apart_m > config.max_disagreement_m * reach or apart_rad > config.max_disagreement_rad:
         return failed(Failure.DIRECTIONS_DISAGREE, result)
     moved_m, moved_rad = (float(d) for d in se3.distance(guess, T))
+    at_features = se3.transform(T, found.points) - se3.transform(guess, found.points)
+    moved_m = min(moved_m, float(np.mean(np.linalg.norm(at_features, axis=-1))))
     far = moved_m > config.max_refinement_m * reach or moved_rad > config.max_refinement_rad
     failure = Failure.FAR_FROM_FEATURES if far else None
     return GeometricVerification(
         failure, found, result, T, information, correction_m=moved_m, correction_rad=moved_rad
     )
+
+
+def _shares_enough(
+    result: Registration, reference: Reference, target: RgbdPyramid, config: GeometricVerificationConfig
+) -> bool:
+    """Whether the target sees enough of the samples, or samples in enough of its image."""
+    if result.overlap >= config.min_overlap:
+        return True
+    if config.min_covered is None:
+        return False
+    T, finest, level = se3.inverse(result.T_reference_target), reference.levels[0], target.levels[0]
+    points = se3.transform(T, finest.points.astype(np.float64))
+    normals = finest.normals.astype(np.float64) @ T[:3, :3].T
+    return projection.covered(points, level.camera, level.inverse_depth, normals) >= config.min_covered
 
 
 def _inliers_needed(count: int, config: GeometricVerificationConfig) -> int:

@@ -75,6 +75,19 @@ def test_overlap_counts_what_is_inside_and_on_the_surface() -> None:
         projection.overlap(points, CAMERA)
 
 
+def test_of_the_image_of_a_nearer_camera_all_is_covered() -> None:
+    """Of a wall at 4 m a camera that stands at 1 m sees a sixteenth, and nothing else."""
+    points = points_of(wall(4.0)) - [0, 0, 3.0]
+    normals, near = np.tile([0.0, 0.0, -1.0], (len(points), 1)), 1 / wall(1.0)
+    assert projection.overlap(points, CAMERA, inverse_depth=near) == pytest.approx(1 / 16, rel=0.15)
+    assert projection.covered(points, CAMERA, near, normals) == 1.0
+    half = near.copy()
+    half[:, CAMERA.width * 3 // 5 :] = 1 / 1.5
+    assert projection.covered(points, CAMERA, half, normals) == pytest.approx(0.6)
+    assert projection.covered(points, CAMERA, near, -normals) == 0.0
+    assert projection.covered(points, CAMERA, np.zeros_like(near), normals) == 0.0
+
+
 def test_points_before_a_wall_are_in_free_space_and_those_behind_it_hidden() -> None:
     depth = wall(2.0)
     depth[:, :10] = 0  # not measured: nothing can be said there

@@ -107,6 +107,45 @@ def test_every_failed_test_has_its_name(views: tuple[VerificationView, Verificat
     assert verify(first, second, CONFIG, registration=strict, rng=rng()).failure is Failure.NOT_REGISTERED
 
 
+def test_what_is_all_of_a_nearer_view_is_enough() -> None:
+    near = pose(z=0.5)
+    both = []
+    _, depth = render(near)
+    v, u = (axis.ravel() for axis in np.mgrid[10:110:20, 10:150:20])
+    points = se3.transform(near, projection.back_project(CAMERA, u, v, depth[v, u].astype(np.float64)))
+    for T, noise in ((near, 1), (FIRST, 2)):
+        pyramid = RgbdPyramid.build(*render(T, np.random.default_rng(noise)), CAMERA)
+        both.append(
+            VerificationView(landmarks(T, points), Reference.from_pyramid(pyramid), lambda p=pyramid: p)
+        )
+    first, second = replace(both[0], reference=None), both[1]
+    limits = RegistrationConfig(min_overlap=0.03)
+
+    def found(**changed: float) -> GeometricVerification:
+        config = CONFIG.model_copy(update={"min_overlap": 0.5} | changed)
+        return verify(first, second, config, registration=limits, rng=rng())
+
+    assert found().failure is Failure.LOW_OVERLAP
+    enough = found(min_covered=0.6)
+    assert enough.failure is None
+    assert enough.registration is not None
+    assert enough.registration.overlap < 0.4
+    assert se3.distance(enough.T_first_second, se3.inverse(near) @ FIRST)[0] < 0.01
+
+
+def test_a_correction_counts_where_it_is_least(views: tuple[VerificationView, VerificationView]) -> None:
+    """Features turned about their middle: the camera moves by more than they do."""
+    first, second = views
+    middle = second.features.points.mean(axis=0).astype(np.float64)
+    turn = se3.exp(np.array([0, 0, 0, 0, 0.03, 0]))
+    turned = se3.transform(turn, second.features.points - middle) + middle
+    second = replace(second, features=replace(second.features, points=turned.astype(np.float32)))
+    found = verify(first, second, CONFIG, registration=REGISTRATION, rng=rng())
+    assert found.failure is None
+    of_camera = 2 * np.sin(0.015) * float(np.hypot(middle[0], middle[2]))
+    assert 0.005 < found.correction_m < 0.6 * of_camera
+
+
 def test_outdoors_limits_of_distances_grow_with_the_depth() -> None:
     """The same views eight times as large; features are 0.1 m off in both."""
 
