@@ -294,29 +294,16 @@ def verify(
     if not found.accepted:
         return failed(Failure.FEW_INLIERS)
     guess = found.T_first_second
-    measured: list[tuple[Registration, Array, Array]] = []  # T_first_second and its information
-    enough = True
-    if first.reference is not None and second.images is not None:
-        target = second.images()
-        forward = register(first.reference, target, guess, registration)
-        measured.append((forward, forward.T_reference_target, forward.information))
-        enough = _shares_enough(forward, first.reference, target, config)
-    if second.reference is not None and first.images is not None:
-        target = first.images()
-        backward = register(second.reference, target, se3.inverse(guess), registration)
-        T_second_first, information = backward.T_reference_target, backward.information
-        turned = se3.inverse_information(T_second_first, information)
-        measured.append((backward, se3.inverse(T_second_first), turned))
-        enough = enough and _shares_enough(backward, second.reference, target, config)
+    measured = _registered(first, second, guess, config=config, registration=registration)
     if not measured:
         raise ValueError("geometric verification needs samples of one view and images of the other")
-    result, T, information = measured[0]
-    for one, _, _ in measured:
-        if not one.ok or np.linalg.eigvalsh(one.information)[0] <= 0:
-            return failed(Failure.NOT_REGISTERED, one)
-    if not enough:
+    result, T, information = measured[0].result, measured[0].T_first_second, measured[0].information
+    for one in measured:
+        if not one.result.ok or np.linalg.eigvalsh(one.result.information)[0] <= 0:
+            return failed(Failure.NOT_REGISTERED, one.result)
+    if not all(one.shares_enough for one in measured):
         return failed(Failure.LOW_OVERLAP, result)
-    apart_m, apart_rad = se3.distance(T, measured[-1][1])
+    apart_m, apart_rad = se3.distance(T, measured[-1].T_first_second)
     reach = reach_factor(max(first.median_depth_m, second.median_depth_m))
     if apart_m > config.max_disagreement_m * reach or apart_rad > config.max_disagreement_rad:
         return failed(Failure.DIRECTIONS_DISAGREE, result)
@@ -328,6 +315,48 @@ def verify(
     return GeometricVerification(
         failure, found, result, T, information, correction_m=moved_m, correction_rad=moved_rad
     )
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """A registration of two views in one direction.
+
+    Attributes:
+        result: as it ended.
+        T_first_second: [4, 4], by it.
+        information: [6, 6] of the right tangent of T_first_second.
+        shares_enough: whether the views share enough there.
+    """
+
+    result: Registration
+    T_first_second: Array
+    information: Array
+    shares_enough: bool
+
+
+def _registered(
+    first: VerificationView,
+    second: VerificationView,
+    T_first_second: Array,
+    *,
+    config: GeometricVerificationConfig,
+    registration: RegistrationConfig,
+) -> list[_Measured]:
+    """Registrations from a motion [4, 4], in the directions that are possible."""
+    measured = []
+    if first.reference is not None and second.images is not None:
+        target = second.images()
+        forward = register(first.reference, target, T_first_second, registration)
+        enough = _shares_enough(forward, first.reference, target, config)
+        measured.append(_Measured(forward, forward.T_reference_target, forward.information, enough))
+    if second.reference is not None and first.images is not None:
+        target = first.images()
+        backward = register(second.reference, target, se3.inverse(T_first_second), registration)
+        enough = _shares_enough(backward, second.reference, target, config)
+        T_second_first = backward.T_reference_target
+        information = se3.inverse_information(T_second_first, backward.information)
+        measured.append(_Measured(backward, se3.inverse(T_second_first), information, enough))
+    return measured
 
 
 def _shares_enough(

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from duagc.pipeline.config.exchange import VerificationConfig
 from duagc.pipeline.config.frontend import LoopConfig, RelocalizationConfig
 from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
 from duagc.pipeline.geometry import projection, se3
@@ -107,8 +108,8 @@ def test_every_failed_test_has_its_name(views: tuple[VerificationView, Verificat
     assert verify(first, second, CONFIG, registration=strict, rng=rng()).failure is Failure.NOT_REGISTERED
 
 
-def test_what_is_all_of_a_nearer_view_is_enough() -> None:
-    near = pose(z=0.5)
+def test_what_is_all_of_a_nearer_view_is_enough_for_robots() -> None:
+    near = pose(z=0.7)
     both = []
     _, depth = render(near)
     v, u = (axis.ravel() for axis in np.mgrid[10:110:20, 10:150:20])
@@ -119,18 +120,17 @@ def test_what_is_all_of_a_nearer_view_is_enough() -> None:
             VerificationView(landmarks(T, points), Reference.from_pyramid(pyramid), lambda p=pyramid: p)
         )
     first, second = replace(both[0], reference=None), both[1]
-    limits = RegistrationConfig(min_overlap=0.03)
 
-    def found(**changed: float) -> GeometricVerification:
-        config = CONFIG.model_copy(update={"min_overlap": 0.5} | changed)
-        return verify(first, second, config, registration=limits, rng=rng())
+    def found(config: VerificationConfig) -> GeometricVerification:
+        return verify(first, second, config, registration=config.registration, rng=rng())
 
-    assert found().failure is Failure.LOW_OVERLAP
-    enough = found(min_covered=0.6)
+    robots = VerificationConfig()
+    assert found(robots.model_copy(update={"min_covered": None})).failure is Failure.LOW_OVERLAP
+    enough = found(robots)
     assert enough.failure is None
     assert enough.registration is not None
-    assert enough.registration.overlap < 0.4
-    assert se3.distance(enough.T_first_second, se3.inverse(near) @ FIRST)[0] < 0.01
+    assert robots.registration.min_overlap < enough.registration.overlap < robots.min_overlap
+    assert se3.distance(enough.T_first_second, se3.inverse(near) @ FIRST)[0] < 0.02
 
 
 def test_a_correction_counts_where_it_is_least(views: tuple[VerificationView, VerificationView]) -> None:
