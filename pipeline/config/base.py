@@ -1,7 +1,12 @@
 """Configuration: frozen models with defaults and documentation, overridden by a TOML file or by `a.b=value`."""
 
+import ast
+import inspect
+import sys
 import tomllib
 from collections.abc import Iterator, Sequence
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -20,9 +25,37 @@ class Config(BaseModel):
         frozen=True,
         extra="forbid",
         validate_default=True,
-        use_attribute_docstrings=True,
         allow_inf_nan=False,
     )
+
+    @classmethod
+    def documentation(cls) -> dict[str, str]:
+        """The text below each setting of the section, by its name; read from the source when somebody asks.
+
+        pydantic would read it (`use_attribute_docstrings`) in every process that imports a section.
+        """
+        found: dict[str, str] = {}
+        for base in reversed(cls.__mro__):
+            if issubclass(base, Config):
+                found |= _documented(base.__module__).get(base.__name__, {})
+        return found
+
+
+@cache
+def _documented(module: str) -> dict[str, dict[str, str]]:
+    """The texts below the attributes of all classes of a module, by class and attribute."""
+    found: dict[str, dict[str, str]] = {}
+    for node in ast.walk(ast.parse(inspect.getsource(sys.modules[module]))):
+        if isinstance(node, ast.ClassDef):
+            found[node.name] = texts = {}
+            for setting, text in pairwise(node.body):
+                match setting, text:
+                    case (
+                        ast.AnnAssign(target=ast.Name(id=name)),
+                        ast.Expr(value=ast.Constant(value=str(words))),
+                    ):
+                        texts[name] = inspect.cleandoc(words)
+    return found
 
 
 LARGEST = 2**62
@@ -188,15 +221,14 @@ def _plain(value: Any) -> Any:
 def _fill(table: Any, config: Config) -> None:
     import tomlkit
 
-    sections = []
-    for name, field in type(config).model_fields.items():
+    sections, documentation = [], config.documentation()
+    for name in type(config).model_fields:
         value = getattr(config, name)
         if isinstance(value, Config):
             sections.append((name, value))
             continue
-        if field.description:
-            for line in field.description.strip().splitlines():
-                table.add(tomlkit.comment(line.strip()))
+        for line in documentation.get(name, "").splitlines():
+            table.add(tomlkit.comment(line.strip()))
         if value is None:  # TOML has no null; leaving a setting out means its default, which is None
             table.add(tomlkit.comment(f"{name} is not set"))
             continue

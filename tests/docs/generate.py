@@ -145,12 +145,12 @@ def _settings(config: Config) -> Iterator[str]:
 def _sections(config: Config, path: str) -> Iterator[str]:
     """This section as a table, then the sections in it."""
     rows, inner = [], []
-    for name, field in type(config).model_fields.items():
+    for name in type(config).model_fields:
         value = getattr(config, name)
         if isinstance(value, Config):
             inner.append((f"{path}.{name}".lstrip("."), value))
         else:
-            rows.append(_row(name, value, field))
+            rows.append(_row(type(config), name, value))
     summary = (type(config).__doc__ or "").strip().splitlines()
     if rows:
         if path:
@@ -170,15 +170,20 @@ def _sections(config: Config, path: str) -> Iterator[str]:
 def _table_of(model: type[Config]) -> str:
     """The settings of a model as a table, with its own defaults."""
     rows = [
-        _row(name, REQUIRED if f.is_required() else f.get_default(call_default_factory=True), f)
+        _row(model, name, REQUIRED if f.is_required() else f.get_default(call_default_factory=True))
         for name, f in model.model_fields.items()
     ]
     return table(("key", "default", "type", "meaning"), rows)
 
 
-def _row(name: str, value: Any, field: FieldInfo) -> tuple[str, str, str, str]:
+def _row(model: type[Config], name: str, value: Any) -> tuple[str, str, str, str]:
     default = "required" if value is REQUIRED else f"`{_plain(value)}`"
-    return f"`{name}`", cell(default), cell(_type(field)), cell(field.description or "")
+    return (
+        f"`{name}`",
+        cell(default),
+        cell(_type(model.model_fields[name])),
+        cell(model.documentation().get(name, "")),
+    )
 
 
 def _plain(value: Any) -> str:

@@ -34,7 +34,7 @@ def test_steps_that_are_set_are_those_of_any_depth(depth: DepthKind) -> None:
 @pytest.mark.parametrize(("name", "setting"), [*zip(TrainingSteps._fields, SETTINGS, strict=True)])
 def test_settings_say_the_steps_that_stand_for_none(name: str, setting: str) -> None:
     exact, noisy = (getattr(STEPS[depth], name) for depth in ("ray_plane", "blended"))
-    said = " ".join((MappingConfig.model_fields[setting].description or "").split())
+    said = " ".join(MappingConfig.documentation()[setting].split())
     assert said.endswith(f"None: {noisy}, or {exact} where depth is exact.")
 
 
