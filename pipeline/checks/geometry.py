@@ -260,9 +260,7 @@ def edges_of(log: RgbdLog, config: EdgeChecks) -> DepthEdges | None:
     for middle in np.unique(spread.astype(int)).tolist():
         frame = log.frame(middle)
         gradient = _gradient(frame.color)
-        near = [
-            _depth_edges(log.frame(middle + k).usable_depth, config.step) for k in range(-shifts, shifts + 1)
-        ]
+        near = [_depth_edges(log.usable_depth(middle + k), config.step) for k in range(-shifts, shifts + 1)]
         if min(int(edges.sum()) for edges in near) < config.min_pixels:
             continue
         by_frames.append([gradient[edges].mean() for edges in near])

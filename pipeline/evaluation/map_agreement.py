@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,9 +16,8 @@ from duagc.pipeline.evaluation.depth_agreement import depth_agreement
 from duagc.pipeline.evaluation.feature_agreement import MatchedPair, feature_agreement, matched_pairs
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import NO_ROTATIONS, Paired
-from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.statistics import evenly_spaced
-from duagc.pipeline.recording import RgbdFrame, open_rgbd
+from duagc.pipeline.recording import RgbdLog, open_rgbd
 
 Path3D = Mapping[int, NDArray[np.float64]]
 """T_frame_camera [4, 4] by time stamp."""
@@ -49,7 +49,8 @@ def matched_views(log_path: Path, known: Sequence[int], *, frontend: Path) -> Ma
         frontend: as of `section`.
     """
     chosen = _chosen(known)
-    return _matched(chosen, *_images(log_path, chosen, frontend))
+    with _opened(log_path, frontend) as log:
+        return _matched(log, chosen)
 
 
 def section(
@@ -102,15 +103,15 @@ def _views(
 ) -> dict[str, Any]:
     """Agreement under every path of some of the held-out frames `known`, and of how many pairs."""
     chosen = _chosen(known)
-    frames, camera = _images(log_path, chosen, frontend)
     poses = {
         name: np.array([path[held_out[index]] for index in chosen]).reshape(-1, 4, 4)
         for name, path in paths.items()
     }
-    pairs, by_depth = depth_agreement([f.usable_depth for f in frames], camera, poses)
-    if matched is None or matched.frames != tuple(chosen):
-        matched = _matched(chosen, frames, camera)
-    by_features = feature_agreement(matched.pairs, camera, poses)
+    with _opened(log_path, frontend) as log:
+        pairs, by_depth = depth_agreement([log.usable_depth(index) for index in chosen], log.camera, poses)
+        if matched is None or matched.frames != tuple(chosen):
+            matched = _matched(log, chosen)
+        by_features = feature_agreement(matched.pairs, log.camera, poses)
     found: dict[str, Any] = {"depth_agreement_pairs": pairs, "feature_agreement_pairs": len(matched.pairs)}
     for name in paths:
         found[f"depth_agreement_m{name}"] = by_depth[name]
@@ -122,12 +123,15 @@ def _chosen(known: Sequence[int]) -> list[int]:
     return [known[k] for k in evenly_spaced(len(known), min(VIEWS, len(known)))]
 
 
-def _images(log_path: Path, chosen: Sequence[int], frontend: Path) -> tuple[list[RgbdFrame], PinholeCamera]:
+@contextmanager
+def _opened(log_path: Path, frontend: Path) -> Iterator[RgbdLog]:
     with open_rgbd(log_path) as log:
         log.move_depth_by(frontend)
-        return [log.frame(index) for index in chosen], log.camera
+        yield log
 
 
-def _matched(chosen: Sequence[int], frames: Sequence[RgbdFrame], camera: PinholeCamera) -> MatchedViews:
+def _matched(log: RgbdLog, chosen: Sequence[int]) -> MatchedViews:
+    frames = [log.frame(index) for index in chosen]
     depths, usable = [f.usable_depth for f in frames], [f.mask for f in frames]
-    return MatchedViews(tuple(chosen), matched_pairs([f.color for f in frames], depths, camera, usable))
+    pairs = matched_pairs([f.color for f in frames], depths, log.camera, usable)
+    return MatchedViews(tuple(chosen), pairs)

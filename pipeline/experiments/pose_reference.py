@@ -223,7 +223,7 @@ def _agreement(
         rows = np.flatnonzero(robot.held_out)
         few = rows[np.unique(np.linspace(0, len(rows) - 1, min(VIEWS, len(rows))).round().astype(np.int64))]
         chosen += [(robot, int(row)) for row in few]
-    depths = [robot.log.frame(int(robot.frame_index[row])).usable_depth for robot, row in chosen]
+    depths = [robot.log.usable_depth(int(robot.frame_index[row])) for robot, row in chosen]
     T = {name: np.array([p[r.run.robot][row] for r, row in chosen]) for name, p in answers.items()}
     medians = depth_agreement.pair_medians(depths, robots[0].log.camera, T)
     together = np.array([chosen[a][0] is chosen[b][0] for a, b in medians.pairs], dtype=bool)

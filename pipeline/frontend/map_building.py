@@ -196,7 +196,7 @@ class MapBuilder:
         if taken:
             seen = [(self._sights.extents[k], self._pose(k)) for k in (*tile, *border)]
             for frame in supporting:
-                depth_m = self.log.frame(frame.frame_index).usable_depth
+                depth_m = self.log.usable_depth(frame.frame_index)
                 T_map_camera = self._pose(frame.keyframe_index) @ frame.T_keyframe_camera
                 seen.append((ViewExtent.of(depth_m, self.log.camera), T_map_camera))
             begun = take_tile(self._whole, tile, seen[: len(tile)], seen[len(tile) :])

@@ -174,7 +174,7 @@ class FrontEnd:
 
 def _depth_views(log: RgbdLog, frames: Sequence[Odometry], free: FreeSpace) -> Iterator[DepthView]:
     for odometry in frames:
-        depth_m, T_map_camera = log.frame(odometry.frame_index).usable_depth, odometry.T_map_camera
+        depth_m, T_map_camera = log.usable_depth(odometry.frame_index), odometry.T_map_camera
         still = free.usable(depth_m, T_map_camera, None)
         yield DepthView(depth_m if still is None else np.where(still, depth_m, np.float32(0)), T_map_camera)
 

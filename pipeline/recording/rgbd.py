@@ -266,9 +266,7 @@ class RgbdLog:
             DuagError: an image is damaged; the line names file, topic and time.
             IndexError: there are fewer frames.
         """
-        if not 0 <= index < len(self):
-            raise IndexError(f"frame {index} of {len(self)}")
-        stamp, depth_stamp = self.pairing.pairs[index]
+        stamp, depth_stamp = self._stamps(index)
         color = self._log.record_at(self._color_topic, self._color_at[stamp])
         image, mask = self._decode_color(color), self._mask_of(stamp)
         found, moved = self._depth_of(stamp, depth_stamp)
@@ -287,6 +285,32 @@ class RgbdLog:
             if self.shutter is None
             else self.shutter.moments(stamp, found.depth_m, self.camera),
         )
+
+    def usable_depth(self, index: int) -> NDArray[np.float32]:
+        """That of one frame, whose color is not read.
+
+        Args:
+            index: position in the log, 0 <= index < len(self).
+
+        Returns:
+            `RgbdFrame.usable_depth`, float32 [H, W].
+
+        Raises:
+            DuagError: an image is damaged; the line names file, topic and time.
+            IndexError: there are fewer frames.
+        """
+        stamp, depth_stamp = self._stamps(index)
+        mask, (found, _) = self._mask_of(stamp), self._depth_of(stamp, depth_stamp)
+        if (still := self._unrolling(stamp, stamp, self.readout.color_s, found)) is not None:
+            mask = still.usable(mask)
+        depth_m = self._of_scene(found.depth_m)
+        return depth_m if mask is None else np.where(mask, depth_m, np.float32(0))
+
+    def _stamps(self, index: int) -> tuple[int, int | None]:
+        """When color and depth of a frame were taken, nanoseconds."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        return self.pairing.pairs[index]
 
     def _depth_of(self, color_ns: int, depth_ns: int | None) -> tuple[DepthImage, bool]:
         """The depth of a frame, and whether it was moved into the time of the color."""

@@ -29,7 +29,12 @@ def _rendered(monkeypatch: pytest.MonkeyPatch) -> None:
             color, depth = detailed(TRUE[HELD_OUT[index]])
             return SimpleNamespace(usable_depth=depth, color=color, mask=None)
 
-        yield SimpleNamespace(camera=CAMERA, frame=frame, move_depth_by=lambda _: None)
+        def usable_depth(index: int) -> Any:
+            return frame(index).usable_depth
+
+        yield SimpleNamespace(
+            camera=CAMERA, frame=frame, usable_depth=usable_depth, move_depth_by=lambda _: None
+        )
 
     monkeypatch.setattr(map_agreement, "open_rgbd", opened)
 

@@ -157,6 +157,7 @@ def test_images_without_a_partner(tmp_path: Path) -> None:
         assert [f.index for f in frames] == list(range(11))
         of = {0: 0, 2: 1, 3: 3, 4: 3, 5: 3, 6: 3}
         for frame in frames:
+            assert np.array_equal(log.usable_depth(frame.index), frame.usable_depth)
             k = frame.stamp_ns // FRAME_NS
             expected = depth(of[k]) * np.float32(0.001) if k in of else np.zeros_like(depth(0), np.float32)
             assert np.array_equal(frame.depth, expected)
@@ -225,6 +226,7 @@ def test_a_mask_of_all_images_holds_with_those_of_single_ones(tmp_path: Path) ->
     with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
         assert np.array_equal(log.valid, valid)
         first, second = log.frame(0), log.frame(1)
+        without_color = [log.usable_depth(k) for k in range(2)]
     assert np.array_equal(first.mask, valid)
     assert np.array_equal(second.mask, valid & usable(1))
     for k, frame in enumerate((first, second)):
@@ -232,6 +234,7 @@ def test_a_mask_of_all_images_holds_with_those_of_single_ones(tmp_path: Path) ->
         assert np.array_equal(frame.color[frame.mask], image(k)[:, :, ::-1][frame.mask])
         assert not frame.depth[~valid].any()
         assert np.array_equal(frame.depth[valid] > 0, depth(k)[valid] > 0)
+        assert np.array_equal(without_color[k], frame.usable_depth)
 
 
 @pytest.mark.parametrize(

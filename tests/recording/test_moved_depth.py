@@ -136,6 +136,7 @@ def test_a_log_moves_its_depth_once_it_knows_how(tmp_path: Path) -> None:
         before = log.frame(2)
         log.move_depth(trajectory([0, 1, 2, 3]))
         after = log.frame(2)
+        assert np.array_equal(log.usable_depth(2), after.usable_depth)
     true = depth_at(1e-9 * 2 * FRAME_NS)
     assert before.depth_offset_ns == after.depth_offset_ns == late_ns
     assert (before.depth_moved, after.depth_moved) == (False, True)

@@ -117,6 +117,7 @@ def test_frames_of_a_log_are_still_once_its_motion_is_known(tmp_path: Path, stat
         assert log.needs_motion == stated
         log.move_depth(Trajectory(np.rint(1e9 * times).astype(np.int64), poses(times)))
         found = log.frame(2)
+        assert np.array_equal(log.usable_depth(2), found.usable_depth)
     if not stated:
         assert np.array_equal(found.color, read.color)
         assert np.array_equal(found.depth, read.depth)
