@@ -112,9 +112,18 @@ def _gap(
 ) -> Gap:
     """The gap of one component whose centralized poses are known."""
     meters, radians = pose_gap(poses, central)
-    among = {name: used_matches(run.robots[name], pairs) for name in members}
+    weights = run.config.exchange.weights
+    evidence = {
+        name: in_world(shared_evidence(*_map_of(run.robots[name]), kind=weights), central[name], weights)
+        for name in members
+    }
     gaps = np.concatenate(
-        [_gaussian_gaps(run, name, members, central, pairs=among[name]) for name in members]
+        [
+            _gaussian_gaps(
+                run, name, central[name], evidence=evidence, pairs=used_matches(run.robots[name], pairs)
+            )
+            for name in members
+        ]
     )
     if not len(gaps):
         return Gap(meters, radians, NO_MATCHES, NO_MATCHES)
@@ -157,17 +166,13 @@ def pose_gap(poses: Mapping[str, Array], central: Mapping[str, Array]) -> tuple[
 def _gaussian_gaps(
     run: RunFolder,
     robot: str,
-    members: Sequence[str],
-    central: Mapping[str, Array],
+    T_world_keyframe: Array,
     *,
+    evidence: Mapping[str, Evidence],
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Array:
     """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
     weights = run.config.exchange.weights
-    evidence = {
-        name: in_world(shared_evidence(*_map_of(run.robots[name]), kind=weights), central[name], weights)
-        for name in members
-    }
     _, own, _, T_map_keyframe = mine = _map_of(run.robots[robot])
     context = MapContext(
         PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is imported is not compared
@@ -176,11 +181,11 @@ def _gaussian_gaps(
         weights=weights,
     )
     best = fuse(
-        OwnMap(robot, own, T_map_keyframe, central[robot]),
+        OwnMap(robot, own, T_map_keyframe, T_world_keyframe),
         evidence,
         pairs,
         context,
-        self_information=in_world(self_information(*mine, kind=weights), central[robot], weights),
+        self_information=in_world(self_information(*mine, kind=weights), T_world_keyframe, weights),
     )
     matched = best.members[: len(own)] > 1
     theta = theta_of(run.robots[robot].fused_map.gaussians.select(slice(0, len(own))))
