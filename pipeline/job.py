@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -17,6 +17,7 @@ from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Step
 from duagc.pipeline.cache.carrier import Carried, NotStoredError
+from duagc.pipeline.cache.code_identity import CodeVersion
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.chain import Chain, Prepared
@@ -61,6 +62,7 @@ class Job:
         log: Say,
         place: Path,
         looking: bool = False,
+        versions: Mapping[str, CodeVersion] | None = None,
     ) -> None:
         """Set up.
 
@@ -72,13 +74,14 @@ class Job:
             log: gets a line at the start of every stage, and every warning.
             place: where an earlier run may be.
             looking: only look what is there: nothing is computed or written.
+            versions: of the code of the stages, by entry; None: they are read.
         """
         self.recording, self.folder, self.config, self.plan, self.log = recording, folder, config, plan, log
         self.carrier = preparation.carrier_of(
             folder, config, plan, log=log, place=place, looking=looking, begun=self._announce
         )
         self.store = self.carrier.store
-        self._versions = {} if self.store is None else preparation.versions(self.store)
+        self._versions = {} if self.store is None else preparation.versions(self.store, versions)
         self.digests = FileDigests(None) if self.store is None else self.store.files
         self.missing: list[StageKey] = []
         self._calibration: dict[str, Any] = {}
@@ -364,7 +367,7 @@ class Job:
     def _is_stored(self) -> bool:
         """Whether nothing would be computed."""
         of = self.recording, self.folder, self.config, self.plan
-        looking = Job(*of, log=self.log, place=self._place, looking=True)
+        looking = Job(*of, log=self.log, place=self._place, looking=True, versions=self._versions)
         try:
             looking.stages()
         except NotStoredError:

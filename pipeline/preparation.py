@@ -67,15 +67,26 @@ def stages_of(run: Path) -> dict[str, Any]:
     return rows if isinstance(rows, dict) else {}
 
 
-def versions(store: Store) -> dict[str, CodeVersion]:
+def versions(store: Store, known: Mapping[str, CodeVersion] | None = None) -> dict[str, CodeVersion]:
     """Versions of the code of all stages, by entry, read now: results of code that is edited later are not kept.
 
     Args:
         store: of the run, which remembers them.
+        known: those that somebody of the same run has read.
     """
+    store.code.adopt(dict(known or {}))
     for stage in (stages.CALIBRATION, *stages.STAGES):
         store.code.version_of(stage.code)
     return store.code.versions
+
+
+def read_code(store: Path) -> None:
+    """Read the code of all stages, so that a run that begins soon finds it read; no more than a second.
+
+    Args:
+        store: folder of the store of that run.
+    """
+    versions(Store(store))
 
 
 def carrier_of(

@@ -20,8 +20,10 @@ from duagc.pipeline.config.packages import check_packages
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.existing_run import is_up_to_date
 from duagc.pipeline.job import Job
-from duagc.pipeline.preparation import Say, say
+from duagc.pipeline.preparation import Say, read_code, say
 from duagc.pipeline.run_plan import LAST, RunPlan
+
+__all__ = ["read_code", "run"]
 
 
 def run(

@@ -1,6 +1,7 @@
 """Commands that run the stages, one by one or all, and compare runs."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated
 
@@ -35,13 +36,16 @@ def demo(
     """
     from duagc.converters.simulate.team import simulate as simulate_recording
     from duagc.pipeline.base.atomic_folder import DEMO, new_folder
-    from duagc.pipeline.cache.store import default_store
-    from duagc.pipeline.config.run import RunConfig
-    from duagc.pipeline.runner import run as run_stages
 
     with new_folder(out, force, DEMO) as folder:
         say(f"simulate: {robots} robots, {frames} frames each")
-        simulate_recording(folder / "recording", robots=robots, frames=frames, seed=seed, workers=workers)
+        with ThreadPoolExecutor(1) as meanwhile:
+            meanwhile.submit(_get_ready, out)  # what is wrong with the store, the run itself will say
+            simulate_recording(folder / "recording", robots=robots, frames=frames, seed=seed, workers=workers)
+        from duagc.pipeline.cache.store import default_store
+        from duagc.pipeline.config.run import RunConfig
+        from duagc.pipeline.runner import run as run_stages
+
         run_stages(
             folder / "recording",
             folder / "run",
@@ -51,6 +55,14 @@ def demo(
             log=say,
         )
     _print_outputs(out / "run")
+
+
+def _get_ready(out: Path) -> None:
+    """Import what a run needs, and read its code, while something else is done first."""
+    from duagc.pipeline.cache.store import default_store
+    from duagc.pipeline.runner import read_code
+
+    read_code(default_store(out))
 
 
 @app.command()

@@ -5,10 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from duagc.pipeline import preparation
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.library_versions import DISTRIBUTIONS, library_version
 from duagc.pipeline.bench import cell_digests
+from duagc.pipeline.cache import code_identity
 from duagc.pipeline.cache.code_identity import CodeReader
+from duagc.pipeline.cache.store import Store
 from duagc.pipeline.experiments.carry_out import SIMULATOR
 from duagc.pipeline.runs import stages
 
@@ -116,6 +119,22 @@ def test_what_was_parsed_is_found_again_and_damage_there_changes_nothing(package
     assert CodeReader(known, package).version_of(ENTRY) == fresh
     known.write_text(known.read_text()[:100])
     assert CodeReader(known, package).version_of(ENTRY) == fresh
+
+
+def test_code_that_was_read_before_a_run_is_not_parsed_by_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    preparation.read_code(tmp_path / "store")
+
+    counted = code_identity._count
+    parsed: list[int] = []
+    monkeypatch.setattr(code_identity, "_count", lambda body: parsed.append(len(body)) or counted(body))
+    known = Store(tmp_path / "store")
+    versions = preparation.versions(known)
+    entries = len(stages.STAGES) + 1
+    assert len(parsed) == entries  # of each stage's entry what it uses; no whole module
+    assert versions == preparation.versions(Store(tmp_path / "store"), versions)
+    assert len(parsed) == entries
 
 
 def test_a_step_that_is_not_there_is_one_line(package: Path) -> None:
