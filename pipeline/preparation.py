@@ -81,7 +81,7 @@ def versions(store: Store, known: Mapping[str, CodeVersion] | None = None) -> di
 
 
 def read_code(store: Path) -> None:
-    """Read the code of all stages, so that a run that begins soon finds it read; no more than a second.
+    """Read the code of all stages, so that a run that begins soon finds it read.
 
     Args:
         store: folder of the store of that run.

@@ -1,6 +1,7 @@
 """Commands that run the stages, one by one or all, and compare runs."""
 
 import json
+import signal
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated
@@ -36,13 +37,14 @@ def demo(
     """
     from duagc.converters.simulate.team import simulate as simulate_recording
     from duagc.pipeline.base.atomic_folder import DEMO, new_folder
+    from duagc.pipeline.cache.store import default_store
 
+    store = default_store(out)
     with new_folder(out, force, DEMO) as folder:
         say(f"simulate: {robots} robots, {frames} frames each")
         with ThreadPoolExecutor(1) as meanwhile:
-            meanwhile.submit(_get_ready, out)  # what is wrong with the store, the run itself will say
+            meanwhile.submit(_read_code, store)  # what is wrong with the store, the run itself will say
             simulate_recording(folder / "recording", robots=robots, frames=frames, seed=seed, workers=workers)
-        from duagc.pipeline.cache.store import default_store
         from duagc.pipeline.config.run import RunConfig
         from duagc.pipeline.runner import run as run_stages
 
@@ -51,18 +53,20 @@ def demo(
             folder / "run",
             RunConfig(seed=seed),
             workers=workers,
-            store=default_store(out),
+            store=store,
             log=say,
         )
     _print_outputs(out / "run")
 
 
-def _get_ready(out: Path) -> None:
-    """Import what a run needs, and read its code, while something else is done first."""
-    from duagc.pipeline.cache.store import default_store
+def _read_code(store: Path) -> None:
+    """Import what a run needs, and read its code, in a thread, while the main one does something else."""
+    signal.pthread_sigmask(
+        signal.SIG_BLOCK, {signal.SIGINT}
+    )  # Ctrl-C is the main thread's, which may hold it back
     from duagc.pipeline.runner import read_code
 
-    read_code(default_store(out))
+    read_code(store)
 
 
 @app.command()

@@ -1,5 +1,6 @@
 """The version of a stage's code changes with what it computes by, and with nothing else."""
 
+from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from duagc.pipeline.bench import cell_digests
 from duagc.pipeline.cache import code_identity
 from duagc.pipeline.cache.code_identity import CodeReader
 from duagc.pipeline.cache.store import Store
+from duagc.pipeline.cli import runs as commands
 from duagc.pipeline.experiments.carry_out import SIMULATOR
 from duagc.pipeline.runs import stages
 
@@ -124,13 +126,12 @@ def test_what_was_parsed_is_found_again_and_damage_there_changes_nothing(package
 def test_code_that_was_read_before_a_run_is_not_parsed_by_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    preparation.read_code(tmp_path / "store")
-
+    with ThreadPoolExecutor(1) as meanwhile:  # as the demo does
+        meanwhile.submit(commands._read_code, tmp_path / "store").result()
     counted = code_identity._count
     parsed: list[int] = []
     monkeypatch.setattr(code_identity, "_count", lambda body: parsed.append(len(body)) or counted(body))
-    known = Store(tmp_path / "store")
-    versions = preparation.versions(known)
+    versions = preparation.versions(Store(tmp_path / "store"))
     entries = len(stages.STAGES) + 1
     assert len(parsed) == entries  # of each stage's entry what it uses; no whole module
     assert versions == preparation.versions(Store(tmp_path / "store"), versions)
