@@ -35,6 +35,7 @@ from duagc.pipeline.evaluation.results import Absent, mean
 from duagc.pipeline.evaluation.views import ScoredFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.depth_noise import DepthNoise
+from duagc.pipeline.geometry.masks import masked_depth
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
@@ -176,7 +177,7 @@ def true_depth(view: ScoredFrame, noise: DepthNoise) -> tuple[NDArray[np.float32
     """
     frame, exact_m = view.frame, view.exact_depth_m
     if not isinstance(exact_m, Absent):
-        exact_m = exact_m if frame.mask is None else np.where(frame.mask, exact_m, np.float32(0))
+        exact_m = masked_depth(exact_m, frame.mask)
         return exact_m, np.zeros(exact_m.shape)
     if frame.depth_sigma is not None:
         return frame.usable_depth, frame.depth_sigma.astype(np.float64)

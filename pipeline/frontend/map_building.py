@@ -24,7 +24,6 @@ from duagc.pipeline.frontend.joint_training import JointTraining, JointView
 from duagc.pipeline.frontend.keyframe_sights import KeyframeSights
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 from duagc.pipeline.frontend.mapping_budget import MappingBudget, alone_steps
-from duagc.pipeline.frontend.mapping_views import masked_depth
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.output import BuiltMap, Maps
 from duagc.pipeline.frontend.shutter import ShutterSearch
@@ -35,6 +34,7 @@ from duagc.pipeline.frontend.tracked import TrackedFrame, tracked_path
 from duagc.pipeline.frontend.view_gain import ViewGain
 from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry.exposure import ExposureTrack
+from duagc.pipeline.geometry.masks import masked_depth
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.messages import Keyframe, MapUpdate

@@ -95,7 +95,7 @@ class View:
         """
         if color.dtype != np.uint8:
             raise ValueError(f"color is an array of {color.dtype}, expected uint8")
-        depth_m = masked_depth(depth_m, mask)
+        depth_m = masks.masked_depth(depth_m, mask)
         near = depth_m[::8, ::8]
         certainty = depth_certainty(depth_m, depth_sigma_m, loss)
         return cls(
@@ -114,7 +114,9 @@ class View:
             exposure=exposure,
             information=np.zeros((6, 6)) if information is None else information,
             T_map_begun=np.array(T_map_camera, dtype=np.float64),
-            far_m=None if far_m is None else np.where(depth_m > 0, np.float32(0), masked_depth(far_m, mask)),
+            far_m=None
+            if far_m is None
+            else np.where(depth_m > 0, np.float32(0), masks.masked_depth(far_m, mask)),
         )
 
     @property
@@ -156,17 +158,6 @@ class View:
             level: 0 = full size, 1 = half.
         """
         return self.mask if level == 0 else self.half_mask
-
-
-def masked_depth(depth_m: Image, mask: NDArray[np.bool_] | None) -> Image:
-    """Depth [H, W], meters, 0 where a mask forbids the pixel.
-
-    Args:
-        depth_m: [H, W], 0 = unknown.
-        mask: bool [H, W], pixels that may be used; None = all.
-    """
-    depth_m = np.asarray(depth_m, dtype=np.float32)
-    return depth_m if mask is None else np.where(mask, depth_m, np.float32(0))
 
 
 def view_overlap(view: View, other: View, camera: PinholeCamera, stride_px: int = 16) -> float:

@@ -20,10 +20,10 @@ from duagc.pipeline.base.open3d_import import import_open3d
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
-from duagc.pipeline.frontend.mapping_views import masked_depth
 from duagc.pipeline.frontend.other_tracker import OtherTracker, Placed, ReadFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.masks import masked_depth
 from duagc.pipeline.registration.search import orthonormal
 
 METERS = 1.0  # of a unit of depth

@@ -22,7 +22,7 @@ from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.mapping import Mapper
-from duagc.pipeline.frontend.mapping_views import halve_depth, masked_depth
+from duagc.pipeline.frontend.mapping_views import halve_depth
 from duagc.pipeline.frontend.other_tracker import OtherTracker, Placed, ReadFrame
 from duagc.pipeline.geometry import masks, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -62,7 +62,7 @@ class FitImages:
             halvings: how often.
         """
         color, mask, sigma_m = images.image, images.mask, images.depth_sigma_m
-        depth_m = masked_depth(images.depth_m, mask)
+        depth_m = masks.masked_depth(images.depth_m, mask)
         for _ in range(halvings):
             color = np.rint(halve(color.astype(np.float32))).astype(np.uint8)
             depth_m = halve_depth(depth_m)

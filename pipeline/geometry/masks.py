@@ -42,6 +42,17 @@ def taken_pixels(image: NDArray[Number], mask: Mask) -> NDArray[Number]:
     return np.compress(mask.ravel(), image.reshape(mask.size, -1), axis=0)
 
 
+def masked_depth(depth_m: NDArray[np.floating], mask: Mask | None) -> NDArray[np.float32]:
+    """Depth float32 [H, W], meters, 0 where a mask forbids the pixel.
+
+    Args:
+        depth_m: [H, W], 0 = unknown.
+        mask: bool [H, W]; None = all may be used.
+    """
+    depth_m = np.asarray(depth_m, dtype=np.float32)
+    return depth_m if mask is None else np.where(mask, depth_m, np.float32(0))
+
+
 def whole_windows(mask: Mask, reach_px: int) -> Mask:
     """Pixels around which a square window holds usable pixels only, [H, W]; beyond the image all count as usable.
 

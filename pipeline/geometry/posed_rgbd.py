@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure, unit_color
+from duagc.pipeline.geometry.masks import masked_depth
 
 
 @dataclass(frozen=True)
@@ -44,4 +45,4 @@ class PosedRgbd:
     @property
     def usable_depth(self) -> NDArray[np.float32]:
         """Depth [H, W] where the mask allows; 0 elsewhere."""
-        return self.depth_m if self.mask is None else np.where(self.mask, self.depth_m, np.float32(0))
+        return masked_depth(self.depth_m, self.mask)

@@ -21,6 +21,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.geometry.masks import masked_depth
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.surface_distance import DepthView
@@ -175,8 +176,7 @@ class FrontEnd:
 def _depth_views(log: RgbdLog, frames: Sequence[Odometry], free: FreeSpace) -> Iterator[DepthView]:
     for odometry in frames:
         depth_m, T_map_camera = log.usable_depth(odometry.frame_index), odometry.T_map_camera
-        still = free.usable(depth_m, T_map_camera, None)
-        yield DepthView(depth_m if still is None else np.where(still, depth_m, np.float32(0)), T_map_camera)
+        yield DepthView(masked_depth(depth_m, free.usable(depth_m, T_map_camera, None)), T_map_camera)
 
 
 def read_frontend(path: Path) -> FrontEnd:

@@ -16,7 +16,8 @@ from duagc.pipeline.recording.names import (
     RECORDING_SCHEMA,
 )
 from duagc.pipeline.recording.read import Record, content_digest, log_metadata, merge, read_log, verify
-from duagc.pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
+from duagc.pipeline.recording.rgbd import RgbdLog, open_rgbd
+from duagc.pipeline.recording.rgbd_frame import RgbdFrame
 from duagc.pipeline.recording.summary import format_info, info, write_preview_of
 from duagc.pipeline.recording.write import LogWriter
 

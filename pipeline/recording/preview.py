@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import encode_png, new_file
 from duagc.pipeline.geometry.masks import checkered
-from duagc.pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
+from duagc.pipeline.recording.rgbd import RgbdLog, open_rgbd
+from duagc.pipeline.recording.rgbd_frame import RgbdFrame
 
 SHOWN = 6  # frames of a robot
 TILE_PX = 240  # width of a picture

@@ -21,39 +21,27 @@ from duagc.pipeline.recording.motion import MotionPrior, motion_prior
 from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, move_depth, tracked_frames
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile, Record
+from duagc.pipeline.recording.rgbd_frame import RgbdFrame
 from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, row_times_ns
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.schemas import topics as topic_table
 
 
 @dataclass(frozen=True)
-class RgbdFrame:
-    """One color image with its depth.
+class _Geometry:
+    """A frame without its color.
 
-    index: position in the log. stamp_ns: when the color was taken. color: uint8 [H, W, 3], RGB; where the mask forbids
-    a pixel that of a usable one next to it. depth: float32 [H, W], meters along z, 0 where nothing was measured and
-    where the camera never shows the scene. mask: bool [H, W], True = usable, False = not of the scene (the rim of an
-    undistorted image, the robot itself), a moving object or otherwise to be ignored; None = all usable.
-    depth_offset_ns: how much later the depth was taken. depth_moved: whether it was moved from there into the time of
-    the color. depth_sigma: float32 [H, W], standard deviation of the depth in meters, 0 where there is no depth; None =
-    unknown. T_camera_moment: after `open_shutter`, [k, 4, 4], k odd, where the camera is meanwhile, seen from the
-    middle; None = it stands still.
+    Attributes:
+        depth: in the time of the color if `depth_moved`; not yet 0 where the camera never shows the scene.
+        depth_moved: as of `RgbdFrame`.
+        mask: bool [H, W], pixels of the still image that may be used; None: all.
+        color_unrolling: makes the color still; None: it is.
     """
 
-    index: int
-    stamp_ns: int
-    color: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    mask: NDArray[np.bool_] | None = None
-    depth_offset_ns: int = 0
-    depth_sigma: NDArray[np.float32] | None = None
-    depth_moved: bool = False
-    T_camera_moment: NDArray[np.float64] | None = None
-
-    @property
-    def usable_depth(self) -> NDArray[np.float32]:
-        """The depth, 0 also where the mask forbids the pixel."""
-        return self.depth if self.mask is None else np.where(self.mask, self.depth, np.float32(0))
+    depth: DepthImage
+    depth_moved: bool
+    mask: NDArray[np.bool_] | None
+    color_unrolling: Unrolling | None
 
 
 class RgbdLog:
@@ -267,11 +255,11 @@ class RgbdLog:
             IndexError: there are fewer frames.
         """
         stamp, depth_stamp = self._stamps(index)
-        color = self._log.record_at(self._color_topic, self._color_at[stamp])
-        image, mask = self._decode_color(color), self._mask_of(stamp)
-        found, moved = self._depth_of(stamp, depth_stamp)
-        if (still := self._unrolling(stamp, stamp, self.readout.color_s, found)) is not None:
-            image, mask = still.color(image), still.usable(mask)
+        image = self._decode_color(self._log.record_at(self._color_topic, self._color_at[stamp]))
+        geometry = self._geometry(stamp, depth_stamp)
+        mask, found = geometry.mask, geometry.depth
+        if geometry.color_unrolling is not None:
+            image = geometry.color_unrolling.color(image)
         return RgbdFrame(
             index,
             stamp,
@@ -280,14 +268,14 @@ class RgbdLog:
             mask=mask,
             depth_offset_ns=self.frame_offset_ns(index),
             depth_sigma=None if found.sigma_m is None else self._of_scene(found.sigma_m),
-            depth_moved=moved,
+            depth_moved=geometry.depth_moved,
             T_camera_moment=None
             if self.shutter is None
             else self.shutter.moments(stamp, found.depth_m, self.camera),
         )
 
     def usable_depth(self, index: int) -> NDArray[np.float32]:
-        """That of one frame, whose color is not read.
+        """The usable depth of one frame, whose color is not read.
 
         Args:
             index: position in the log, 0 <= index < len(self).
@@ -299,18 +287,21 @@ class RgbdLog:
             DuagError: an image is damaged; the line names file, topic and time.
             IndexError: there are fewer frames.
         """
-        stamp, depth_stamp = self._stamps(index)
-        mask, (found, _) = self._mask_of(stamp), self._depth_of(stamp, depth_stamp)
-        if (still := self._unrolling(stamp, stamp, self.readout.color_s, found)) is not None:
-            mask = still.usable(mask)
-        depth_m = self._of_scene(found.depth_m)
-        return depth_m if mask is None else np.where(mask, depth_m, np.float32(0))
+        found = self._geometry(*self._stamps(index))
+        return masks.masked_depth(self._of_scene(found.depth.depth_m), found.mask)
 
     def _stamps(self, index: int) -> tuple[int, int | None]:
         """When color and depth of a frame were taken, nanoseconds."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         return self.pairing.pairs[index]
+
+    def _geometry(self, color_ns: int, depth_ns: int | None) -> _Geometry:
+        """What a frame has besides its color."""
+        mask = self._mask_of(color_ns)
+        depth, moved = self._depth_of(color_ns, depth_ns)
+        unrolling = self._unrolling(color_ns, color_ns, self.readout.color_s, depth)
+        return _Geometry(depth, moved, mask if unrolling is None else unrolling.usable(mask), unrolling)
 
     def _depth_of(self, color_ns: int, depth_ns: int | None) -> tuple[DepthImage, bool]:
         """The depth of a frame, and whether it was moved into the time of the color."""
