@@ -149,6 +149,9 @@ def describe() -> str:
     for name in sorted(DATASETS):
         module = _module(name)
         lines.append(f"{name}: {(module.__doc__ or '').splitlines()[0]}")
+        documented = module.Options.documentation()
         for option, field in module.Options.model_fields.items():
-            lines.append(f"    --set {option}={field.default}  {' '.join((field.description or '').split())}")
+            lines.append(
+                f"    --set {option}={field.default}  {' '.join(documented.get(option, '').split())}"
+            )
     return "\n".join(lines)

@@ -108,3 +108,9 @@ def test_arguments_are_no_options(tmp_path: Path, option: str) -> None:
     name = option.partition("=")[0]
     with pytest.raises(DuagError, match=f"7scenes: {name} is no option of a converter"):
         registry.convert("7scenes", tmp_path, tmp_path / "rec", options=[option])
+
+
+def test_the_list_of_datasets_says_what_every_option_is() -> None:
+    options = [line.strip() for line in registry.describe().splitlines() if line.startswith(" ")]
+    assert len(options) > 50
+    assert not [line for line in options if not line.partition("  ")[2]]

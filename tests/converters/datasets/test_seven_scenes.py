@@ -171,7 +171,7 @@ def test_the_command_finds_the_converter(sequence: Path, tmp_path: Path) -> None
 
 
 def test_every_option_is_documented() -> None:
-    assert all(field.description for field in seven_scenes.Options.model_fields.values())
+    assert seven_scenes.Options.model_fields.keys() <= seven_scenes.Options.documentation().keys()
 
 
 # --- the real thing ---------------------------------------------------------------------------------------------------
