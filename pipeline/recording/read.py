@@ -207,6 +207,7 @@ class LogFile:
                 for topic, channel in self.channels.items()
             }
         self._chunks: OrderedDict[int, bytes] = OrderedDict()
+        self._sound_chunks = set[int]()  # whose own checksum has been compared
 
     def __enter__(self) -> LogFile:
         return self
@@ -326,9 +327,9 @@ class LogFile:
     def _chunk(self, start: int) -> bytes:
         if start not in self._chunks:
             self._stream.seek(start + 9)
-            stream, length = get_chunk_data_stream(
-                Chunk.read(ReadDataStream(self._stream)), validate_crc=True
-            )
+            chunk, new = Chunk.read(ReadDataStream(self._stream)), start not in self._sound_chunks
+            stream, length = get_chunk_data_stream(chunk, validate_crc=new)
+            self._sound_chunks.add(start)
             self._chunks[start] = stream.read(length)
             if len(self._chunks) > _CHUNKS_KEPT:
                 self._chunks.popitem(last=False)
