@@ -310,6 +310,9 @@ class ModelConfig(Config):
     """Opacity of the drawn map below which a pixel is not used."""
     strides: tuple[PositiveInt, ...] = (2, 2, 1)
     """Pixels between samples of the drawn map, finest level first."""
+    shared_view: float = Field(default=0.01, ge=0.0)
+    """The map is drawn once for frames whose images are this far apart at most, as a share of their width; 0: for
+    each of them."""
 
 
 class DelayConfig(Config):

@@ -40,6 +40,7 @@ from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.training_frames import seen_distance_m
 
 Result = TypeVar("Result")
 
@@ -378,5 +379,16 @@ class MapBuilder:
             registration=self.config.tracking.registration,
             threads=self._threads,
         )
-        register = partial(model.register_if_worth, log=self.log, T_map_keyframe=T_map_keyframe, views=views)
-        return self._checkpoints.each(f"{self.name}.model", frames, register)
+        worth = [frame for frame in frames if model.is_worth(frame, views)]
+        placed = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in worth]
+        distance_m = seen_distance_m(self._whole.gaussians, T_map_keyframe)
+        drawn = model.views(np.array(placed).reshape(-1, 4, 4), distance_m)
+        T_map_view = {frame.frame_index: T for frame, T in zip(worth, drawn, strict=True)}
+
+        def registered(frame: TrackedFrame) -> TrackedFrame:
+            if frame.frame_index not in T_map_view:
+                return frame
+            images, anchor = self.log.frame(frame.frame_index), T_map_keyframe[frame.keyframe_index]
+            return model.register(frame, images, anchor, T_map_view[frame.frame_index])
+
+        return self._checkpoints.each(f"{self.name}.model", frames, registered)

@@ -21,8 +21,9 @@ from duagc.pipeline.frontend.frame_images import pyramid_of
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.image_motion import nearby_cameras
 from duagc.pipeline.kernels import Rasterizer
-from duagc.pipeline.recording import RgbdFrame, RgbdLog
+from duagc.pipeline.recording import RgbdFrame
 from duagc.pipeline.registration import Reference, RegistrationConfig, RgbdPyramid, register
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -57,8 +58,36 @@ class ModelTracker:
             self._camera, self._halvings = self._camera.halved(), self._halvings + 1
         self._levels = max(1, len(registration.iterations) - self._halvings)
         self._rasterizer = Rasterizer(threads=threads)
+        self._last: tuple[bytes, Reference] | None = None
 
-    def register(self, tracked: TrackedFrame, frame: RgbdFrame, T_map_keyframe: Array) -> TrackedFrame:
+    def is_worth(self, tracked: TrackedFrame, views: frozenset[int]) -> bool:
+        """Whether the color of a frame may say more than tracking.
+
+        Args:
+            tracked: any frame of the log.
+            views: indices of the frames that made the map.
+        """
+        reasons = {Reason.NO_DEPTH} if self._depth == "ray_plane" else {Reason.NO_DEPTH, Reason.NONE}
+        placed = tracked.status is not Status.LOST and tracked.reason in reasons
+        return placed and tracked.frame_index not in views
+
+    def views(self, T_map_camera: Array, distance_m: float) -> Array:
+        """Where the map is drawn for frames, [n, 4, 4]: once for all that see nearly the same.
+
+        Args:
+            T_map_camera: [n, 4, 4], of the frames, in order of time.
+            distance_m: of what they see.
+        """
+        most_rad = self.config.shared_view * self._full.width / self._full.fx
+        return T_map_camera[nearby_cameras(T_map_camera, distance_m, most_rad)]
+
+    def register(
+        self,
+        tracked: TrackedFrame,
+        frame: RgbdFrame,
+        T_map_keyframe: Array,
+        T_map_view: Array | None = None,
+    ) -> TrackedFrame:
         """Register the color of a frame to the map, with its tracked pose as the prior.
 
         It stays as tracked if the registration fails. Its information stays that of tracking: map and frame share
@@ -68,40 +97,32 @@ class ModelTracker:
             tracked: not lost.
             frame: its images.
             T_map_keyframe: [4, 4], of the keyframe that it is anchored to.
+            T_map_view: [4, 4], where the map is drawn; None: where the frame is.
         """
         T_map_camera = T_map_keyframe @ tracked.T_keyframe_camera
+        T_map_view = T_map_camera if T_map_view is None else T_map_view
+        T_view_camera = se3.inverse(T_map_view) @ T_map_camera
         seen = pyramid_of(frame, self._full, self._levels + self._halvings)
         found = register(
-            self._drawn(T_map_camera),
+            self._drawn(T_map_view),
             RgbdPyramid(seen.levels[self._halvings :]).without_depth(),
-            np.eye(4),
+            T_view_camera,
             self._registration,
             prior_information=tracked.information,
         )
         if not found.ok:
             return tracked
-        return replace(tracked, T_keyframe_camera=tracked.T_keyframe_camera @ found.T_reference_target)
+        moved = se3.inverse(T_view_camera) @ found.T_reference_target
+        return replace(tracked, T_keyframe_camera=tracked.T_keyframe_camera @ moved)
 
-    def register_if_worth(
-        self, tracked: TrackedFrame, log: RgbdLog, T_map_keyframe: Array, views: frozenset[int]
-    ) -> TrackedFrame:
-        """Register a frame where that says more than tracking.
+    def _drawn(self, T_map_view: Array) -> Reference:
+        """The map as a camera sees it; that of the last time is kept."""
+        place = T_map_view.tobytes()
+        if self._last is None or self._last[0] != place:
+            self._last = place, self._reference(T_map_view)
+        return self._last[1]
 
-        Args:
-            tracked: any frame of the log.
-            log: of the robot.
-            T_map_keyframe: [k, 4, 4], of all keyframes.
-            views: indices of the frames that made the map.
-        """
-        reasons = {Reason.NO_DEPTH} if self._depth == "ray_plane" else {Reason.NO_DEPTH, Reason.NONE}
-        made_it = tracked.frame_index in views
-        if tracked.status is Status.LOST or tracked.reason not in reasons or made_it:
-            return tracked
-        images = log.frame(tracked.frame_index)
-        return self.register(tracked, images, T_map_keyframe[tracked.keyframe_index])
-
-    def _drawn(self, T_map_camera: Array) -> Reference:
-        """What a camera at T_map_camera sees of the map."""
+    def _reference(self, T_map_camera: Array) -> Reference:
         drawn, layer_m = self._rasterizer.forward_with_layer(
             self._gaussians, self._camera, se3.inverse(T_map_camera), depth_kind=self._depth
         )

@@ -92,6 +92,27 @@ def test_a_poor_pose_becomes_a_good_one(maps: list[Gaussians]) -> None:
     assert (after.frame_index, after.status, after.keyframe_index) == (1, Status.OK, 0)
 
 
+def test_a_view_from_nearby_serves_as_well(maps: list[Gaussians]) -> None:
+    before = tracked(0.02)
+    nearby = T_KEYFRAME_FRAME @ se3.exp(np.array([0.01, -0.01, 0.01, 0.003, 0.004, -0.004]))
+    found = [tracker(gaussians).register(before, seen(), np.eye(4), nearby) for gaussians in maps]
+    poor, *good = (np.array(se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME)) for f in (before, *found))
+    assert (np.mean(good, axis=0) < 0.6 * poor).all()
+
+
+def test_frames_that_see_nearly_the_same_share_a_view() -> None:
+    turning = np.array([se3.exp(np.array([0, 0, 0, 0, 0.002 * k, 0])) for k in range(30)])
+    shared, alone = (
+        tracker(Gaussians.empty(), ModelConfig(shared_view=share)).views(turning, 1.0)
+        for share in (0.01, 0.0)
+    )
+    np.testing.assert_array_equal(alone, turning)
+    off = [se3.distance(*pair)[1] for pair in zip(shared, turning, strict=True)]
+    most_rad = 0.01 * CAMERA.width / CAMERA.fx
+    assert 0.5 * most_rad < max(off) <= most_rad
+    assert len(np.unique(shared, axis=0)) < 5
+
+
 def test_a_pose_that_is_known_exactly_stays(gaussians: Gaussians) -> None:
     before = tracked(1e-7)
     after = tracker(gaussians).register(before, seen(), np.eye(4))

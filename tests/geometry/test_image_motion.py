@@ -1,10 +1,12 @@
 """Images of a camera that moves slowly are chosen, in every part of a path."""
 
+from itertools import accumulate
+
 import numpy as np
 import pytest
 
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.image_motion import image_speeds, slowest_of_parts
+from duagc.pipeline.geometry.image_motion import image_shift, image_speeds, nearby_cameras, slowest_of_parts
 from duagc.pipeline.geometry.trajectory import Trajectory
 
 
@@ -48,3 +50,22 @@ def test_every_part_gives_its_slowest(total: int) -> None:
 def test_a_path_of_one_pose_stands_still() -> None:
     assert image_speeds(path_of([]), 1.0).tolist() == [0.0]
     assert len(image_speeds(Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4))), 1.0)) == 0
+
+
+@pytest.mark.parametrize("most_rad", [0.0, 0.03, 0.1, 10.0])
+def test_a_camera_nearby_is_near_and_serves_several(most_rad: float) -> None:
+    rng = np.random.default_rng(3)
+    steps = se3.exp(rng.normal(size=(40, 6)) * [0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
+    poses = np.array(list(accumulate(steps, np.matmul)))
+    near = nearby_cameras(poses, 2.0, most_rad)
+    assert (image_shift(poses, poses[near], 2.0) <= most_rad + 1e-12).all()
+    assert (np.diff(near) >= 0).all()
+    used = np.unique(near)
+    np.testing.assert_array_equal(near[used], used)
+    assert len(used) == {0.0: 40, 10.0: 1 + 39 // 40}.get(most_rad, len(used))
+    first_of_next = np.searchsorted(near, used[:-1], side="right")
+    assert (image_shift(poses[used[:-1]], poses[first_of_next], 2.0) > most_rad).all()
+
+
+def test_no_camera_has_none_nearby() -> None:
+    assert nearby_cameras(np.zeros((0, 4, 4)), 1.0, 0.1).shape == (0,)
