@@ -32,7 +32,7 @@ class TrainingSteps(NamedTuple):
 
 
 STEPS: dict[DepthKind, TrainingSteps] = {
-    "ray_plane": TrainingSteps(keyframe=32, final=64, final_view=16),
+    "ray_plane": TrainingSteps(keyframe=32, final=56, final_view=14),
     "blended": TrainingSteps(keyframe=8, final=72, final_view=18),
 }
 """Where nothing else is set. On exact depth a step at a keyframe is worth more than one at the end; on noisy depth it
@@ -126,10 +126,10 @@ class MappingConfig(Config):
     iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""
     final_iterations: int | None = Field(default=None, ge=0)
-    """Steps of the final optimization for every keyframe, at full size, shared by all views. None: 72, or 64 where
+    """Steps of the final optimization for every keyframe, at full size, shared by all views. None: 72, or 56 where
     depth is exact."""
     final_iterations_view: int | None = Field(default=None, ge=0)
-    """The same for every view, keyframe or supporting frame; the larger number of steps counts. None: 18, or 16 where
+    """The same for every view, keyframe or supporting frame; the larger number of steps counts. None: 18, or 14 where
     depth is exact."""
     final_iterations_max: int = 6000
     """Most steps of the final optimization of a tile."""
@@ -184,9 +184,11 @@ class MappingConfig(Config):
     sweep_keyframes: int = 6
     """Keyframes, the newest and those that see most of what it sees, in whose images the contributions of the Gaussians
     are measured at every keyframe."""
-    min_contribution: float = 0.25
+    min_contribution: float = 1.0
     """Gaussians whose removal changes all keyframes together by less are pruned in the first half of the final
-    optimization: the squared change of half-size images, in units of the noise below."""
+    optimization: the squared change of images, in units of the noise below."""
+    contribution_pixels: int = Field(default=20_000, ge=1)
+    """It is measured in images that are halved, at least once, until they have no more pixels."""
     contribution_color_sigma: float = 0.03
     """Noise of colors (0..1) by which a change of an image is measured."""
     contribution_depth_sigma_m: float = 0.02

@@ -213,5 +213,5 @@ class MapContent:
     def _contributions(self, views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """What these views would lack of each Gaussian; and if any saw it (`contributions`)."""
         return contributions(
-            self.gaussians, views, self.rasterizer, self.config, camera=self.cameras[1], depth=self.depth
+            self.gaussians, views, self.rasterizer, self.config, camera=self.cameras[0], depth=self.depth
         )

@@ -15,7 +15,7 @@ from duagc.pipeline.config.training import (
 )
 from duagc.pipeline.evaluation.image_metrics import depth_error, psnr
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
-from duagc.pipeline.frontend.mapping_views import View, view_overlap
+from duagc.pipeline.frontend.mapping_views import View, halve_depth, view_overlap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer
@@ -234,11 +234,13 @@ def test_a_map_without_anything_stays_empty() -> None:
     assert mapper.finalize().total == 0
 
 
-def test_what_contributes_least_goes_first() -> None:
-    mapper, _ = build(views=1)
+@pytest.mark.parametrize("halvings", [1, 2])
+def test_what_contributes_least_goes_first(halvings: int) -> None:
+    pixels = CAMERA.width * CAMERA.height // 4**halvings
+    mapper, _ = build(QUICK.model_copy(update={"contribution_pixels": pixels}), views=1)
     contributions, _ = mapper._contributions(mapper._views)
     mapper._map.update_contributions(*mapper._contributions(mapper._views))
-    camera = CAMERA.halved()
+    camera = CAMERA.halved() if halvings == 1 else CAMERA.halved().halved()
 
     def change(index: int) -> float:
         """Squared change of the view, in units of the noise, when one Gaussian is left out."""
@@ -250,9 +252,10 @@ def test_what_contributes_least_goes_first() -> None:
         color = np.sum(
             ((whole.color - without.color) / config.contribution_color_sigma).astype(np.float64) ** 2
         )
-        measured = mapper._views[0].half_depth_m > 0
+        depth_m = mapper._views[0].half_depth_m
+        measured = (depth_m if halvings == 1 else halve_depth(depth_m)) > 0
         depth = ((whole.depth - without.depth) / config.contribution_depth_sigma_m)[measured]
-        return float(color + np.sum(depth.astype(np.float64) ** 2))
+        return 4**halvings * float(color + np.sum(depth.astype(np.float64) ** 2))
 
     for index in (10, 100, 200):  # thresholds of the kernel (1/255, early stop) flip a few pixels
         assert contributions[index] == pytest.approx(change(index), rel=0.05)

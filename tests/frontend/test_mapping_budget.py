@@ -21,8 +21,8 @@ def test_exact_depth_takes_more_steps_at_keyframes_and_fewer_at_the_end() -> Non
     exact, noisy = (MappingBudget(MappingConfig(), CAMERA, depth) for depth in ("ray_plane", "blended"))
     assert exact.keyframe_steps(STAMPS_NS) == [32] * 3
     assert noisy.keyframe_steps(STAMPS_NS) == [8] * 3
-    assert [b.final_steps(10, 10, 1.0)[0] for b in (exact, noisy)] == [640, 720]
-    assert [b.final_steps(10, 50, 1.0)[0] for b in (exact, noisy)] == [800, 900]
+    assert [b.final_steps(10, 10, 1.0)[0] for b in (exact, noisy)] == [560, 720]
+    assert [b.final_steps(10, 50, 1.0)[0] for b in (exact, noisy)] == [700, 900]
 
 
 @pytest.mark.parametrize("depth", STEPS)
