@@ -187,7 +187,7 @@ class MappingConfig(Config):
     min_contribution: float = 1.0
     """Gaussians whose removal changes all keyframes together by less are pruned in the first half of the final
     optimization: the squared change of images, in units of the noise below."""
-    contribution_pixels: int = Field(default=20_000, ge=1)
+    contribution_pixels: int = Field(default=20_000, ge=64)
     """It is measured in images that are halved, at least once, until they have no more pixels."""
     contribution_color_sigma: float = 0.03
     """Noise of colors (0..1) by which a change of an image is measured."""

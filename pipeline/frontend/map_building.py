@@ -382,7 +382,7 @@ class MapBuilder:
         worth = [frame for frame in frames if model.is_worth(frame, views)]
         placed = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in worth]
         distance_m = seen_distance_m(self._whole.gaussians, T_map_keyframe)
-        drawn = model.views(np.array(placed).reshape(-1, 4, 4), distance_m)
+        drawn = model.drawn_from(np.array(placed).reshape(-1, 4, 4), distance_m)
         T_map_view = {frame.frame_index: T for frame, T in zip(worth, drawn, strict=True)}
 
         def registered(frame: TrackedFrame) -> TrackedFrame:

@@ -71,7 +71,7 @@ class ModelTracker:
         placed = tracked.status is not Status.LOST and tracked.reason in reasons
         return placed and tracked.frame_index not in views
 
-    def views(self, T_map_camera: Array, distance_m: float) -> Array:
+    def drawn_from(self, T_map_camera: Array, distance_m: float) -> Array:
         """Where the map is drawn for frames, [n, 4, 4]: once for all that see nearly the same.
 
         Args:

@@ -103,7 +103,7 @@ def test_a_view_from_nearby_serves_as_well(maps: list[Gaussians]) -> None:
 def test_frames_that_see_nearly_the_same_share_a_view() -> None:
     turning = np.array([se3.exp(np.array([0, 0, 0, 0, 0.002 * k, 0])) for k in range(30)])
     shared, alone = (
-        tracker(Gaussians.empty(), ModelConfig(shared_view=share)).views(turning, 1.0)
+        tracker(Gaussians.empty(), ModelConfig(shared_view=share)).drawn_from(turning, 1.0)
         for share in (0.01, 0.0)
     )
     np.testing.assert_array_equal(alone, turning)
