@@ -13,7 +13,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import Trajectory
 
 MOST_BEFORE = 16
-"""Cameras before the one that they share; to look for more takes longer than it saves."""
+"""Cameras before the one that they share: of a camera that stands still, few pairs are compared."""
 
 
 def image_shift(T_map_first: Array, T_map_second: Array, distance_m: float) -> Array:
