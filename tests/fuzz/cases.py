@@ -55,6 +55,7 @@ class Outcome:
 @contextmanager
 def seeded(reader: Reader) -> Iterator[Path]:
     """A folder with the undamaged files of a reader, which it must be able to read and must leave as they are."""
+    threads = _threads()
     place = SHARED_MEMORY if os.access(SHARED_MEMORY, os.W_OK) else None
     with tempfile.TemporaryDirectory(prefix=f"fuzz-{reader.name}-", dir=place) as folder:
         root = Path(folder)
@@ -66,7 +67,9 @@ def seeded(reader: Reader) -> Iterator[Path]:
         before = _contents(root / "seed")
         reader.read(root / "seed", root / "trial")  # imports everything, and must work
         shutil.rmtree(root / "trial")
-        _end_threads()  # a lock that one of them holds would be locked for ever in the processes of the batches
+        _settle_threads(
+            threads
+        )  # a lock that another holds would be locked for ever in the processes of the batches
         gc.collect()
         gc.freeze()
         yield root
@@ -117,6 +120,22 @@ def _end_threads() -> None:
     for thread in threading.enumerate():
         if thread is not threading.main_thread():
             thread.join(timeout=1.0)
+
+
+def _settle_threads(before: int) -> None:
+    """Wait until there are no more threads than before for the system too. One that Python has joined may still hold a
+    lock of OpenCV, which frees what belongs to the thread: a copy of the process would never get it."""
+    _end_threads()
+    ends = time.monotonic() + 60.0
+    while (now := _threads()) > before:
+        if time.monotonic() > ends:
+            raise RuntimeError(f"found {now} threads, expected {before}: {threading.enumerate()}")
+        time.sleep(0.001)
+
+
+def _threads() -> int:
+    """How many threads this process has; a list of /proc/self/task may miss some while others end."""
+    return int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[17])
 
 
 def _ended(reader: Reader, src: Path, out: Path) -> tuple[str, str]:
@@ -210,6 +229,8 @@ def _lines(pipe: BinaryIO, child: int) -> Iterator[bytes]:
             return
         idle_s, (*lines, rest) = 0, (rest + data).split(b"\n")
         yield from lines
+    os.kill(child, signal.SIGUSR1)  # states where its threads wait
+    time.sleep(0.5)
 
 
 def _session(leader: int) -> tuple[bool, int]:
@@ -229,12 +250,12 @@ def _crash(status: int, trace: Path) -> str:
     """Why a process ended that had not finished a case."""
     if not os.WIFSIGNALED(status):
         return f"ended with {os.WEXITSTATUS(status)}"
-    number = os.WTERMSIG(status)
+    number, where = os.WTERMSIG(status), trace.read_text(errors="replace") if trace.exists() else ""
     if number == signal.SIGKILL:
-        return f"waits: slept for {IDLE_S} s"
+        return f"{where}\nwaits: slept for {IDLE_S} s"
     if number == signal.SIGXCPU:
         return f"more than {CPU_S} s"
-    return f"{trace.read_text(errors='replace') if trace.exists() else ''}\nsignal {number}"
+    return f"{where}\nsignal {number}"
 
 
 def _work(reader: Reader, root: Path, numbers: range, tell: int) -> NoReturn:
@@ -247,6 +268,7 @@ def _work(reader: Reader, root: Path, numbers: range, tell: int) -> NoReturn:
             os.dup2(null, stream)
         with (root / "crash").open("w") as trace:
             faulthandler.enable(trace)
+            faulthandler.register(signal.SIGUSR1, trace)
             for number in numbers:
                 for line in run_case(reader, root, number):
                     os.write(tell, json.dumps(line).encode() + b"\n")

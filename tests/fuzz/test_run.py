@@ -1,5 +1,6 @@
 """The runner itself notices what it is there for."""
 
+import ctypes
 import os
 import signal
 import threading
@@ -77,6 +78,7 @@ def third_fails(src: Path, out: Path) -> None:
 
 
 LEFT: list[Any] = []
+STARTED: list[str] = []
 
 
 def fake(read: Callable[[Path, Path], None]) -> Reader:
@@ -114,7 +116,10 @@ def test_outcomes(read: Callable[[Path, Path], None], kind: str, words: str) -> 
         assert (outcome.kind, words in outcome.text) == (kind, True), outcome.text
 
 
-@pytest.mark.parametrize(("read", "words"), [(wait, "waits"), (doze, "waits"), (work, "more than 1 s")])
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [(wait, " in wait\n"), (doze, " in doze\n"), (wait, "\nwaits: slept"), (work, "more than 1 s")],
+)
 def test_hangs(read: Callable[[Path, Path], None], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.fuzz.cases.CPU_S", 1)
     monkeypatch.setattr("tests.fuzz.cases.IDLE_S", 1)
@@ -134,6 +139,23 @@ def test_no_lock_of_a_thread_that_reads_ahead_is_inherited() -> None:
             threading.Thread(target=hold).start()
         elif not lock.acquire(timeout=5.0):
             raise ValueError("locked")
+
+    (outcome,) = cases(Reader("fake", fake(read).make, read, lambda path, rng: False), 1)
+    assert outcome.kind == "read", outcome.text
+
+
+def test_a_thread_that_has_been_joined_has_ended_for_the_system_too() -> None:
+    libc, key = ctypes.CDLL(None), ctypes.c_uint()
+    libc.pthread_key_create(ctypes.byref(key), libc.usleep)  # called after Python has let go of the thread
+
+    def read(src: Path, out: Path) -> None:
+        if src.name == "seed":
+            thread = threading.Thread(target=lambda: libc.pthread_setspecific(key, ctypes.c_void_p(300_000)))
+            thread.start()
+            thread.join()
+            STARTED.append(str(thread.native_id))
+        elif STARTED.pop() in os.listdir(f"/proc/{os.getppid()}/task"):
+            raise ValueError("copied while it ended")
 
     (outcome,) = cases(Reader("fake", fake(read).make, read, lambda path, rng: False), 1)
     assert outcome.kind == "read", outcome.text
