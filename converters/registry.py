@@ -1,6 +1,5 @@
 """From files as they are distributed to recordings: one module per dataset, named in one table."""
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -115,13 +114,10 @@ def _options_of_file(path: Path | None, module: ModuleType, dataset: str) -> Ite
         return
     from duagc.converters.layouts.image_files import options_of
     from duagc.converters.writer import OPTIONS_FILE
-    from duagc.pipeline.base.files import read_text
+    from duagc.pipeline.base.files import read_text, read_toml
 
-    text = read_text(path, "options of a converter in TOML")
-    try:
-        values = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise DuagError(f"{path}: {error}, expected options of a converter in TOML") from error
+    expected = "options of a converter in TOML"
+    text, values = read_text(path, expected), read_toml(path, expected)
     if hasattr(module, "Options"):
         of_converter = {name: value for name, value in values.items() if name != "masks"}
         options_of(module.Options, of_converter, f"{path}, for {dataset}")

@@ -11,7 +11,6 @@ color = "/jackal/camera/color/image_raw"     # options for this robot
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from duagc.converters.logs.options import LogOptions
 from duagc.converters.writer import robot_names
 from duagc.pipeline.base.atomic_folder import RECORDING, RUN
 from duagc.pipeline.base.errors import DuagError, closest
-from duagc.pipeline.base.files import check_file, read_text
+from duagc.pipeline.base.files import check_file, read_toml
 from duagc.schemas import topics
 
 NAMESPACE = "{namespace}"  # stands for that of each robot in the names of topics
@@ -120,10 +119,7 @@ def robot_of(namespace: str) -> str:
 
 def _from_file(path: Path, options: Mapping[str, Any]) -> list[Source]:
     """The robots that a TOML file lists."""
-    try:
-        content = tomllib.loads(read_text(path, "a TOML file that lists robots"))
-    except tomllib.TOMLDecodeError as error:
-        raise DuagError(f"{path}: not valid TOML: {error}") from error
+    content = read_toml(path, "a TOML file that lists robots")
     robots = content.pop("robots", None)
     if not isinstance(robots, dict) or not robots:
         raise DuagError(f"{path}: found no [robots.NAME], expected one for each robot")

@@ -54,6 +54,16 @@ def read_text(path: Path, expected: str) -> str:
         raise DuagError(f"{path}: is not text, expected {expected}") from error
 
 
+def read_toml(path: Path, expected: str) -> dict[str, Any]:
+    """The content of a TOML file. Raises DuagError as `check_file` does, and if it is not TOML."""
+    import tomllib
+
+    try:
+        return tomllib.loads(read_text(path, expected))
+    except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
+        raise DuagError(f"{path}: not valid TOML: {error}, expected {expected}") from error
+
+
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """A name next to `path` to write to: it becomes `path` when the block ends well, else it is removed.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -13,7 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from duagc.pipeline.base.errors import DuagError, closest
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import read_toml
 from duagc.pipeline.config.base import Config, load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.run_plan import LAST, NAMES
@@ -108,10 +107,7 @@ def read_suite(path: Path) -> Suite:
     Raises:
         DuagError: it is no suite, or names what does not exist.
     """
-    try:
-        values = tomllib.loads(read_text(path, "a suite"))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise DuagError(f"{path}: not valid TOML: {error}") from error
+    values = read_toml(path, "a suite")
     try:
         file = SuiteFile.model_validate(values)
     except ValidationError as error:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import check_file, read_text
+from duagc.pipeline.base.files import check_file, read_text, read_toml
 from duagc.pipeline.comparison.fields import Unequal, unequal
 from duagc.pipeline.comparison.recordings import description_of, files_of, made_otherwise, points_of
 from duagc.pipeline.comparison.summary import ORDER, stage_of
@@ -147,17 +147,12 @@ def _files(path: Path, kind: str) -> list[str]:
 
 def _settings(first: Path, second: Path) -> list[str]:
     """Settings that differ: they explain differences, and are none."""
-    import tomllib
-
     tables = []
     for run in (first, second):
         path = run / "config.toml"
         if not path.is_file():
             return []
-        try:
-            tables.append(tomllib.loads(read_text(path, "the configuration of a run")))
-        except tomllib.TOMLDecodeError as error:
-            raise DuagError(f"{path}: not valid TOML: {error}") from error
+        tables.append(read_toml(path, "the configuration of a run"))
     return [f"setting {found.text()}" for found in unequal(tables[0], tables[1])]
 
 

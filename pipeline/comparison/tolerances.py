@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 from pydantic import Field, ValidationError
 
 from duagc.pipeline.base.errors import DuagError, closest
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import read_toml
 from duagc.pipeline.comparison.fields import Unequal
 from duagc.pipeline.config.base import Config
 
@@ -62,10 +61,7 @@ def read_tolerances(path: Path) -> Tolerances:
     Raises:
         DuagError: it is not such a file; a tolerance without a reason is none.
     """
-    try:
-        content = tomllib.loads(read_text(path, "a TOML file of tolerances"))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise DuagError(f"{path}: not valid TOML: {error}") from error
+    content = read_toml(path, "a TOML file of tolerances")
     rows = content.pop("tolerance", [])
     if content or not isinstance(rows, list):
         raise DuagError(

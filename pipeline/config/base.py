@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from duagc.pipeline.base.errors import DuagError, closest
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import read_toml
 
 
 class Config(BaseModel):
@@ -78,10 +78,7 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
     source = "configuration"
     if path is not None:
         source = str(path)
-        try:
-            values = tomllib.loads(read_text(Path(path), "a TOML configuration"))
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise DuagError(f"{path}: not valid TOML: {error}") from error
+        values = read_toml(Path(path), "a TOML configuration")
     for override in overrides:
         _apply(values, override)
     try:
@@ -112,9 +109,19 @@ def _check_numbers(config: Config, source: str, prefix: str = "") -> None:
                 _check_numbers(number, source, f"{prefix}{name}.")
             elif isinstance(number, int | float):
                 if number < 0 and not field.metadata:
-                    raise DuagError(f"{where} is {number:g}, expected 0 or more")
+                    raise DuagError(f"{where} is {_short(number)}, expected 0 or more")
                 if abs(number) > LARGEST:
-                    raise DuagError(f"{where} is {float(number):.3g}, expected at most {LARGEST:g}")
+                    raise DuagError(f"{where} is {_short(number)}, expected at most {LARGEST:g}")
+
+
+def _short(number: int | float) -> str:
+    """With a few digits, also an integer that no float can hold."""
+    try:
+        return f"{number:g}"
+    except OverflowError:
+        from decimal import Decimal
+
+        return f"{Decimal(number):.5e}"
 
 
 def _nearest(model: type[Config], path: Sequence[str]) -> str:
@@ -185,7 +192,7 @@ def value_of(text: str, where: str) -> Any:
         where: of messages.
 
     Raises:
-        DuagError: it is several lines, or nested too deep.
+        DuagError: it is several lines, nested too deep, or a number of more than 4300 digits.
     """
     text = text.strip()
     if "\n" in text:
@@ -196,6 +203,8 @@ def value_of(text: str, where: str) -> Any:
         return text
     except RecursionError as error:
         raise DuagError(f"{where}: is nested too deep, expected a value") from error
+    except ValueError as error:
+        raise DuagError(f"{where}: {error}, expected a value") from error
 
 
 def dump_config(config: Config) -> str:

@@ -214,10 +214,10 @@ def read_experiment(name: str, folder: Path = RULES) -> Experiment:
     data = read_bytes(path, "an experiment")
     try:
         file = ExperimentFile.model_validate(tomllib.loads(data.decode()))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DuagError(f"{path}: not valid TOML: {error}") from error
     except ValidationError as error:
         raise DuagError(f"{path}: {_complaint(error)}") from error
+    except (ValueError, RecursionError) as error:
+        raise DuagError(f"{path}: not valid TOML: {error}") from error
     _check(path, file)
     return Experiment(name, path, hashlib.sha256(data).hexdigest(), file)
 

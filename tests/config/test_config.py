@@ -58,6 +58,9 @@ def test_overrides_win_over_the_file(tmp_path: Path) -> None:
         ("link.loss_probability=much", "link.loss_probability = 'much'"),
         ("seed", "expected section.name=value"),
         ("seed.x=1", "seed = {'x': 1}"),
+        pytest.param("seed=" + 400 * "9", "seed is 1.00000e+400, expected at most 4.61169e+18", id="large"),
+        pytest.param("seed=-" + 400 * "9", "seed is -1.00000e+400, expected 0 or more", id="small"),
+        pytest.param("seed=" + 5000 * "9", "value has 5000 digits", id="long"),
     ],
 )
 def test_errors_name_the_setting(override: str, expected: str) -> None:
@@ -69,9 +72,10 @@ def test_errors_name_the_setting(override: str, expected: str) -> None:
 
 def test_broken_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
-    path.write_text("seed = = 3")
-    with pytest.raises(DuagError, match=r"c\.toml: not valid TOML"):
-        load_config(Whole, path)
+    for text in ("seed = = 3", "seed = " + 5000 * "9", "seed = " + 5000 * "["):
+        path.write_text(text)
+        with pytest.raises(DuagError, match=r"c\.toml: not valid TOML.*, expected a TOML configuration"):
+            load_config(Whole, path)
     with pytest.raises(DuagError, match=r"absent\.toml"):
         load_config(Whole, tmp_path / "absent.toml")
 
