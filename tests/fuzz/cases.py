@@ -201,7 +201,7 @@ def _batch(reader: Reader, root: Path, numbers: range) -> Iterator[Outcome]:
     os.close(tell)
     what, number, outcome = "", numbers.start, None
     with open(stated, "rb", buffering=0) as pipe:
-        for line in _lines(pipe, child):
+        for line in _lines(pipe, child, root / "crash"):
             key, _, text = json.loads(line).partition(" ")
             if key == "damage":
                 what = text
@@ -216,8 +216,9 @@ def _batch(reader: Reader, root: Path, numbers: range) -> Iterator[Outcome]:
         shutil.rmtree(root / f"case-{number}", ignore_errors=True)
 
 
-def _lines(pipe: BinaryIO, child: int) -> Iterator[bytes]:
-    """What a child states, until it ends, or waits for `IDLE_S` for something that does not come."""
+def _lines(pipe: BinaryIO, child: int, trace: Path) -> Iterator[bytes]:
+    """What a child states, until it ends, or waits for `IDLE_S` for something that does not come; then it writes to
+    `trace` where."""
     rest, idle_s, before, awake = b"", 0, 0, AWAKE * os.sysconf("SC_CLK_TCK")
     while idle_s < IDLE_S:
         if not select.select([pipe], [], [], 1.0)[0]:
@@ -229,21 +230,25 @@ def _lines(pipe: BinaryIO, child: int) -> Iterator[bytes]:
             return
         idle_s, (*lines, rest) = 0, (rest + data).split(b"\n")
         yield from lines
-    os.kill(child, signal.SIGUSR1)  # states where its threads wait
-    time.sleep(0.5)
+    os.kill(child, signal.SIGUSR1)
+    ends, size, same = time.monotonic() + 30.0, 0, 0
+    while same < 2 and time.monotonic() < ends:  # until there is something, and no more comes
+        time.sleep(0.5)
+        before, size = size, trace.stat().st_size if trace.exists() else 0
+        same = same + 1 if size == before > 0 else 0
 
 
 def _session(leader: int) -> tuple[bool, int]:
     """Whether all processes of a session sleep (not for a disc or for their turn), and how long they have worked."""
-    asleep, work = True, 0
+    states, work = "", 0
     for entry in os.listdir("/proc"):
         if entry.isdecimal():
             with suppress(OSError):
                 state, *numbers = Path(f"/proc/{entry}/stat").read_text().rpartition(")")[2].split()
                 if int(numbers[2]) == leader:
-                    asleep = asleep and state in "SZ"
+                    states += state
                     work += sum(map(int, numbers[10:14]))
-    return asleep, work
+    return bool(states) and set(states) <= set("SZ"), work
 
 
 def _crash(status: int, trace: Path) -> str:
