@@ -114,10 +114,11 @@ def _options_of_file(path: Path | None, module: ModuleType, dataset: str) -> Ite
         return
     from duagc.converters.layouts.image_files import options_of
     from duagc.converters.writer import OPTIONS_FILE
-    from duagc.pipeline.base.files import read_text, read_toml
+    from duagc.pipeline.base.files import parse_toml, read_text
 
     expected = "options of a converter in TOML"
-    text, values = read_text(path, expected), read_toml(path, expected)
+    text = read_text(path, expected)
+    values = parse_toml(text, path, expected)
     if hasattr(module, "Options"):
         of_converter = {name: value for name, value in values.items() if name != "masks"}
         options_of(module.Options, of_converter, f"{path}, for {dataset}")

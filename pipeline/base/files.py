@@ -56,10 +56,15 @@ def read_text(path: Path, expected: str) -> str:
 
 def read_toml(path: Path, expected: str) -> dict[str, Any]:
     """The content of a TOML file. Raises DuagError as `check_file` does, and if it is not TOML."""
+    return parse_toml(read_text(path, expected), path, expected)
+
+
+def parse_toml(text: str, path: Path, expected: str) -> dict[str, Any]:
+    """The content of a TOML file whose text is there. Raises DuagError if it is not TOML."""
     import tomllib
 
     try:
-        return tomllib.loads(read_text(path, expected))
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
         raise DuagError(f"{path}: not valid TOML: {error}, expected {expected}") from error
 

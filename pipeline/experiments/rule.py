@@ -7,7 +7,6 @@ another rule is found out.
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from pydantic import Field, ValidationError
 from duagc.converters.simulate.sensors.rig import Rig
 from duagc.converters.simulate.settings import SimulationSettings
 from duagc.pipeline.base.errors import DuagError, closest
-from duagc.pipeline.base.files import read_bytes
+from duagc.pipeline.base.files import parse_toml, read_text
 from duagc.pipeline.config.base import Config, load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.experiments.metric_names import check_metric
@@ -211,15 +210,13 @@ def read_experiment(name: str, folder: Path = RULES) -> Experiment:
         raise DuagError(
             f"{name}: is no experiment, {closest(name, experiment_names(folder), 'an experiment')}"
         )
-    data = read_bytes(path, "an experiment")
+    text = read_text(path, "an experiment")
     try:
-        file = ExperimentFile.model_validate(tomllib.loads(data.decode()))
+        file = ExperimentFile.model_validate(parse_toml(text, path, "an experiment"))
     except ValidationError as error:
         raise DuagError(f"{path}: {_complaint(error)}") from error
-    except (ValueError, RecursionError) as error:
-        raise DuagError(f"{path}: not valid TOML: {error}") from error
     _check(path, file)
-    return Experiment(name, path, hashlib.sha256(data).hexdigest(), file)
+    return Experiment(name, path, hashlib.sha256(text.encode()).hexdigest(), file)
 
 
 def config_of(experiment: ExperimentFile, profile: Profile, configuration: str) -> list[str]:

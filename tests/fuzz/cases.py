@@ -67,9 +67,8 @@ def seeded(reader: Reader) -> Iterator[Path]:
         before = _contents(root / "seed")
         reader.read(root / "seed", root / "trial")  # imports everything, and must work
         shutil.rmtree(root / "trial")
-        _settle_threads(
-            threads
-        )  # a lock that another holds would be locked for ever in the processes of the batches
+        # a lock that another thread holds would be locked for ever in the processes of the batches
+        _settle_threads(threads)
         gc.collect()
         gc.freeze()
         yield root
@@ -230,9 +229,14 @@ def _lines(pipe: BinaryIO, child: int, trace: Path) -> Iterator[bytes]:
             return
         idle_s, (*lines, rest) = 0, (rest + data).split(b"\n")
         yield from lines
+    _tell_where(child, trace)
+
+
+def _tell_where(child: int, trace: Path) -> None:
+    """Have a child write to `trace` where its threads are; until there is something, and for a second no more."""
     os.kill(child, signal.SIGUSR1)
     ends, size, same = time.monotonic() + 30.0, 0, 0
-    while same < 2 and time.monotonic() < ends:  # until there is something, and no more comes
+    while same < 2 and time.monotonic() < ends:
         time.sleep(0.5)
         before, size = size, trace.stat().st_size if trace.exists() else 0
         same = same + 1 if size == before > 0 else 0

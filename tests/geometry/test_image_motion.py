@@ -52,7 +52,9 @@ def test_a_path_of_one_pose_stands_still() -> None:
     assert len(image_speeds(Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4))), 1.0)) == 0
 
 
-@pytest.mark.parametrize(("most_rad", "least", "most"), [(0.0, 40, 40), (0.06, 2, 20), (10.0, 1, 1)])
+@pytest.mark.parametrize(
+    ("most_rad", "least", "most"), [(0.0, 40, 40), (0.03, 11, 30), (0.06, 2, 20), (0.1, 2, 10), (10.0, 1, 1)]
+)
 def test_a_camera_nearby_is_near_and_serves_several(most_rad: float, least: int, most: int) -> None:
     rng = np.random.default_rng(3)
     steps = se3.exp(rng.normal(size=(40, 6)) * [0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
