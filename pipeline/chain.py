@@ -83,7 +83,8 @@ class Chain:
             timing.went_on(label("frontend", robot), *checkpoints.before_s)
             timing.stages[label("frontend", robot)]["parts"] = parts
             made = [sum(1 for _ in read_log(path, [topics.KEYFRAME])) for path in folder.glob("*.mcap")]
-            return size | {"keyframes": sum(made)}
+            kind = next(read_log(folder / "frontend.mcap", [topics.MAP])).proto().depth
+            return size | {"keyframes": sum(made), "exact": int(kind == "ray_plane")}
 
         def written() -> Iterator[Path]:
             for of_component in steps.move_components(robot, folder).values():

@@ -23,7 +23,7 @@ from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.chain import Chain, Prepared
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.preparation import FusionPool, RobotProcesses, Say, with_keyframes, workers_that_fit
+from duagc.pipeline.preparation import FusionPool, RobotProcesses, Say, with_expected, workers_that_fit
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
@@ -324,7 +324,7 @@ class Job:
         for robot in stored:
             found |= chain.robot(robot, threads=threads_per_worker(1), alone=alone)
         if absent:
-            sizes = with_keyframes(self._sizes(absent), self.recording, self.config.frontend.keyframes)
+            sizes = with_expected(self._sizes(absent), self.recording, self.config.frontend)
             workers = self._fitting(sizes)
             self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
             self._time_left = self._expected(sizes, found, workers)

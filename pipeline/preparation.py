@@ -26,7 +26,7 @@ from duagc.pipeline.cache.footprint import fitting, robot_bytes
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store
 from duagc.pipeline.chain import Chain, Prepared
-from duagc.pipeline.config.frontend import KeyframeConfig
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import RunPlan
@@ -125,23 +125,21 @@ def carrier_of(
     )
 
 
-def with_keyframes(
-    sizes: Mapping[str, Mapping[str, int]], recording: Recording, rule: KeyframeConfig
+def with_expected(
+    sizes: Mapping[str, Mapping[str, int]], recording: Recording, config: FrontendConfig
 ) -> dict[str, dict[str, int]]:
-    """Sizes of logs, with about how many keyframes those of `LONG_FRAMES` and more will have.
+    """Sizes of logs, with what is expected of those of `LONG_FRAMES` and more: keyframes, and whether depth is exact.
 
     Args:
         sizes: `frames`, and the rest of what is known, of every robot.
         recording: of these robots.
-        rule: when a frame becomes a keyframe.
+        config: of their front ends.
     """
-    from duagc.pipeline.checks.check import expected_keyframes
+    from duagc.pipeline.checks.check import expected_size
 
     def counted(robot: str) -> dict[str, int]:
         size = dict(sizes[robot])
-        if size["frames"] >= LONG_FRAMES:
-            size["keyframes"] = expected_keyframes(recording.log(robot), rule).expected
-        return size
+        return size | (expected_size(recording.log(robot), config) if size["frames"] >= LONG_FRAMES else {})
 
     return dict(zip(sizes, in_order(counted, sizes), strict=True))
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 from duagc.pipeline.base.machine import processors
-from duagc.pipeline.base.worker_reports import OF_TEAM
+from duagc.pipeline.base.worker_reports import KEYFRAMES, OF_TEAM
 from duagc.pipeline.cache import durations
 from duagc.pipeline.cache.durations import Size
 from duagc.pipeline.cache.footprint import KEYFRAMES_OF_FRAMES
@@ -22,7 +22,7 @@ from duagc.pipeline.runs import stages
 EVERY_S = 10.0
 UNHEARD = ("poses", "information", "surface", "agreement")
 """Parts of a front end, and of an evaluation, that do not say how far they are."""
-PARTS = {"tracking again": "tracking", "keyframes": "poses"}
+PARTS = {"tracking again": "tracking"}
 """Parts of a front end that are not named as in `durations`."""
 IMAGES = (START, "tracking", "poses", "model")
 """Parts of a front end that take as long as images are large, as the evaluation does."""
@@ -125,8 +125,8 @@ class TimeLeft:
                 work.end(now)
                 self._words.pop(robot, None)
                 return
-            if part == "keyframes":
-                self._sizes[robot]["keyframes"] = total
+            if part in KEYFRAMES.values():
+                self._sizes[robot] |= {"keyframes": total, "exact": int(part == KEYFRAMES["ray_plane"])}
                 work.parts |= self._front_end(self._sizes[robot])
                 self._predict_later()
             name = _part_of(part)

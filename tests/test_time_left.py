@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from duagc.pipeline.base import machine
-from duagc.pipeline.base.worker_reports import OF_TEAM
+from duagc.pipeline.base.worker_reports import KEYFRAMES, OF_TEAM
 from duagc.pipeline.cache import durations
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.runs import stages
@@ -22,8 +22,8 @@ LATER = (stages.EXCHANGE, stages.FUSION, stages.EVALUATION, stages.REPORT, stage
 class Simulated:
     """A run whose stages take what is predicted, times a factor for the machine, and one for each part."""
 
-    def __init__(self, robots: int, workers: int, slower: float, uneven: float) -> None:
-        self.now = 0.0
+    def __init__(self, robots: int, workers: int, slower: float, uneven: float, *, exact: int = 0) -> None:
+        self.now, self.exact = 0.0, exact
         self.slower, self.uneven = slower, itertools.cycle((uneven, 1 / uneven, 1.0))
         names = [f"robot{k}" for k in range(robots)]
         self.sizes = {name: {"frames": 300 + 40 * k, "pixels": 640 * 480} for k, name in enumerate(names)}
@@ -36,13 +36,14 @@ class Simulated:
     def front_end(self, robot: str, begin: float) -> list[tuple[float, tuple[str, str, int, int]]]:
         """Steps with their times."""
         keyframes, steps = self.sizes[robot]["frames"] // 20, []
-        size = {**self.sizes[robot], "keyframes": keyframes}
+        size = {**self.sizes[robot], "keyframes": keyframes, "exact": self.exact}
         at = begin
         inflation = self.slower * durations.slowdown(self.workers, machine.processors())
         for part, seconds in durations.front_end_parts(size, MAPPING).items():
             took = seconds * inflation * next(self.uneven)
             if part == "poses":
-                steps.append((at, (robot, "keyframes", keyframes, keyframes)))
+                part_of_keyframes = KEYFRAMES["ray_plane" if self.exact else "blended"]
+                steps.append((at, (robot, part_of_keyframes, keyframes, keyframes)))
             name = part if part == "tracking" else f"{robot}.{part}"
             count = 0 if part == "start" else STEPS.get(part, 3)
             steps += [(at + took * (k + 1) / count, (robot, name, k + 1, count)) for k in range(count)]
@@ -107,6 +108,15 @@ def test_it_is_right_within_a_third_after_a_tenth(robots: int, slower: float) ->
         if abs(left - (whole - now)) > max((whole - now) / 3, whole / 20)
     ]
     assert not wrong, wrong[:5]
+
+
+@pytest.mark.parametrize("exact", [0, 1])
+def test_how_maps_are_made_is_known_when_the_keyframes_are(exact: int) -> None:
+    simulated = Simulated(1, 1, 1.0, uneven=1.0, exact=exact)
+    simulated.times.step("robot0", KEYFRAMES["ray_plane" if exact else "blended"], 15, 15)
+    size = {**simulated.sizes["robot0"], "keyframes": 15, "exact": exact}
+    expected = durations.front_end_parts(size, MAPPING) | {"information": durations.information_s(size)}
+    assert simulated.times._front.of["robot0"].parts == expected
 
 
 def test_before_the_first_step_it_is_what_is_predicted() -> None:

@@ -12,6 +12,8 @@ Step = tuple[str, str, int, int]
 """Of a robot: its name, what is done of it, steps done, steps in all; 0 of 0: it is done."""
 OF_TEAM = ""
 """In the place of a robot's name: a step of what is done for all robots together."""
+KEYFRAMES = {"blended": "keyframes", "ray_plane": "keyframes with exact depth"}
+"""Part of a front end that says how many keyframes there are, by how the depth of Gaussians is drawn."""
 Hear = Callable[[Step], None]
 """Gets steps."""
 _queues: list[SimpleQueue[Step | None]] = []

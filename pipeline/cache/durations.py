@@ -1,8 +1,8 @@
 """Time that the stages of a run take, before they start, and while they are at work.
 
-Seconds of one of the two busy threads of a core of 2.6 GHz, fitted to the parts of a whole run
-(docs/reference/checks.md). What a machine is slower by, and what a recording is harder by, shows while the run goes on,
-or in the results of earlier ones (`checks.measured`).
+Seconds of one of two busy processors of 2.6 GHz, fitted to the parts of whole runs (docs/lab, predicted-times). What a
+machine is slower by, and what a recording is harder by, shows while the run goes on, or in the results of earlier ones
+(`checks.measured`).
 """
 
 from __future__ import annotations
@@ -17,32 +17,37 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import DepthKind
 
 Size = Mapping[str, int]
-"""`frames`, `pixels` of an image and `keyframes` of a robot; `moved`: 1 if depth is of other times than color."""
-TRACKING_S, POSES_S, MODEL_S = (0.005, 0.039), (0.007, 0.025), (0.001, 0.057)
-"""Of a frame: in any case, and for every million pixels."""
-MOVED_S = 0.14
+"""`frames`, `pixels` of an image and `keyframes` of a robot; `moved`: 1 if depth is of other times than color;
+`exact`: 1 if depth is exact, as far as is known."""
+TRACKING_S, POSES_S, MODEL_S = (0.003, 0.020), (0.001, 0.020), (0.001, 0.025)
+"""Of a frame: in any case, and for every million pixels. There is no model where depth is exact."""
+TRACKED_KEYFRAME_S, POSED_KEYFRAME_S = (0.02, 0.23), 0.05
+"""The same of a keyframe that is tracked; and of one whose pose is optimized, in any case and once more for every
+`POSED_TOGETHER` keyframes of the log."""
+POSED_TOGETHER = 150
+MOVED_S = 0.10
 """Of moving the depth of a frame, for every million pixels; every stage that reads a frame does it."""
-SEEDING_S = (0.0, 0.3)
-"""The same of what a keyframe seeds and prunes."""
-MAPPING_S = (0.0015, 0.086)
-"""The same of a step of mapping, of which every keyframe takes some."""
-FINAL_S = (0.0030, 0.080)
-"""The same of a step of the final optimization."""
-MAPPING_OF_TILES, FINAL_OF_TILES = 1.9, 1.7
-"""By how much longer a step takes in a map of many tiles, whose views see Gaussians of others (docs/lab, length)."""
-USUAL_DEPTH: DepthKind = "blended"
-"""Of maps, as far as is known before they are made: by their steps those of exact depth take about as long."""
+GAUSSIANS_OF_PIXELS = 0.09
+"""Gaussians of a tile for every pixel of its keyframes, up to its cap."""
+SEEDING_S = 0.75
+"""Of what a keyframe seeds and prunes, for every million pixels."""
+MAPPING_S, FINAL_S = (0.10, 0.021), (0.19, 0.027)
+"""Of a step at a keyframe, and of one of the final optimization: for every million Gaussians, and pixels."""
+MANY_TILES = 13
+MAPPING_OF_TILES, FINAL_OF_TILES, FUSION_OF_TILES, SCORED_OF_TILES = 1.8, 2.2, 2.9, 6.0
+"""By how much longer that takes in a map of so many tiles, whose views see Gaussians of others, and by how much a step
+of its training after fusion, and a render of it."""
 START_S = 2.0
 """Of a process."""
-INFORMATION_S, DEVIATION_S = 0.020, 0.10
+INFORMATION_S, DEVIATION_S = 0.005, 0.10
 """Of a frame, and of one that shows how far Gaussians are from the surface, for every million pixels."""
-INFORMATION_OF_TILE_S = 0.003
-"""Of a keyframe, which draws the whole map, for every tile but one."""
+INFORMATION_OF_KEYFRAME_S, INFORMATION_OF_TILE_S = (0.03, 0.19), 0.007
+"""Of a keyframe: in any case, and for every million pixels; and, as it draws the whole map, for every tile but one."""
 FUSION_S = 1.0
 """Of a robot that has peers."""
-FUSED_VIEW_S = (0.062, 0.73)
-"""Of a view that its fused map is trained on: in any case, and for every million pixels."""
-SCORED_S, COMPARED_S = (0.006, 0.200), (0.02, 0.55)
+FUSED_STEP_S = (0.012, 0.095)
+"""Of a step on an own view, with those on peers' maps: in any case, and for every million pixels."""
+SCORED_S, COMPARED_S = (0.004, 0.100), (0.01, 0.38)
 """The same of a render that is scored, and of a view that is compared with the others."""
 SURFACE_S = 2.0
 """Of an evaluation of a robot, for its logs and the true surface."""
@@ -52,12 +57,21 @@ VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
 RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
 """Maps that are drawn at a held-out view, at a keyframe, and at a view of a peer."""
-EXCHANGE_S, EXCHANGED_KEYFRAME_S = (2.0, 10.0), 0.035
+EXCHANGE_S, EXCHANGED_KEYFRAME_S = (1.0, 4.0), 0.06
 """Of a robot that has peers: in any case, and for every million pixels; and of each of its keyframes."""
-REPORT_S, VIEW_S = 5.0, 2.0
+REPORT_S, VIEW_S = 4.0, 2.0
 """Of the whole run."""
 SERIAL = 0.15
 """Share of a stage of several threads that one thread does."""
+
+
+def depth_of(size: Size) -> DepthKind:
+    """How the depth of a robot's Gaussians is drawn, as far as is known.
+
+    Args:
+        size: of its log.
+    """
+    return "ray_plane" if size.get("exact") else "blended"
 
 
 def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
@@ -67,22 +81,23 @@ def front_end_parts(size: Size, mapping: MappingConfig) -> dict[str, float]:
         size: of the robot's log.
         mapping: how long its map is optimized.
     """
-    frames, keyframes = size["frames"], size["keyframes"]
-    steps = mapping.steps(USUAL_DEPTH).keyframe
+    frames, keyframes, depth = size["frames"], size["keyframes"], depth_of(size)
 
     def of(cost: tuple[float, float]) -> float:
         return _of_pixels(cost, size)
 
     moved = _moved_s(size) * frames
+    tracked = of(TRACKING_S) * frames + of(TRACKED_KEYFRAME_S) * keyframes
+    posed = POSED_KEYFRAME_S * keyframes * (1 + keyframes / POSED_TOGETHER)
+    step = _step_s(MAPPING_S, size, mapping) * _longer(MAPPING_OF_TILES, size, mapping)
+    last = _step_s(FINAL_S, size, mapping) * _longer(FINAL_OF_TILES, size, mapping)
     return {
         "start": START_S,
-        "tracking": of(TRACKING_S) * frames + (of(TRACKING_S) * frames + moved if moved else 0.0),
-        "poses": of(POSES_S) * frames + moved,
-        "mapping": (of(SEEDING_S) + of(MAPPING_S) * steps)
-        * keyframes
-        * _longer(MAPPING_OF_TILES, size, mapping),
-        "final": of(FINAL_S) * _final_steps(size, mapping) * _longer(FINAL_OF_TILES, size, mapping),
-        "model": of(MODEL_S) * frames + moved,
+        "tracking": tracked + (tracked + moved if moved else 0.0),
+        "poses": of(POSES_S) * frames + posed + moved,
+        "mapping": (of((0.0, SEEDING_S)) + step * mapping.steps(depth).keyframe) * keyframes,
+        "final": last * _final_steps(size, mapping),
+        "model": of(MODEL_S) * frames + moved if depth == "blended" else 0.0,
     }
 
 
@@ -103,8 +118,9 @@ def information_s(size: Size) -> float:
         size: of its log.
     """
     shown = min(size["frames"], InformationConfig().deviation_frames)
-    drawn_s = INFORMATION_OF_TILE_S * size["keyframes"] * (_tiles(size, MappingConfig()) - 1)
-    return size["pixels"] * 1e-6 * (INFORMATION_S * size["frames"] + DEVIATION_S * shown) + drawn_s
+    drawn_s = INFORMATION_OF_TILE_S * (_tiles(size, MappingConfig()) - 1)
+    keyframes_s = (_of_pixels(INFORMATION_OF_KEYFRAME_S, size) + drawn_s) * size["keyframes"]
+    return size["pixels"] * 1e-6 * (INFORMATION_S * size["frames"] + DEVIATION_S * shown) + keyframes_s
 
 
 def fusion_s(size: Size) -> float:
@@ -113,9 +129,10 @@ def fusion_s(size: Size) -> float:
     Args:
         size: of its log.
     """
-    view_s = _of_pixels(FUSED_VIEW_S, size) + _moved_s(size)
-    longer = _longer(FINAL_OF_TILES, size, MappingConfig())
-    return FUSION_S + view_s * _trained_views(size, FinetuneConfig()) * longer
+    config = FinetuneConfig()
+    step_s = _of_pixels(FUSED_STEP_S, size) * _longer(FUSION_OF_TILES, size, MappingConfig())
+    view_s = step_s * config.steps(depth_of(size)).per_view + _moved_s(size)
+    return FUSION_S + view_s * _trained_views(size, config)
 
 
 def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
@@ -127,7 +144,8 @@ def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
     """
     views, keyframes = min(VIEWS, size["frames"] / HELD_OUT), min(VIEWS, size["keyframes"])
     of_peers = min(VIEWS, (robots - 1) * size["frames"] / HELD_OUT)
-    scored_s, compared_s, read_s = _of_pixels(SCORED_S, size), _of_pixels(COMPARED_S, size), _moved_s(size)
+    scored_s = _of_pixels(SCORED_S, size) * _longer(SCORED_OF_TILES, size, MappingConfig())
+    compared_s, read_s = _of_pixels(COMPARED_S, size), _moved_s(size)
     return {
         "held_out": (read_s + scored_s * RENDERS) * views,
         "training": (read_s + scored_s * KEYFRAME_RENDERS) * keyframes,
@@ -210,7 +228,14 @@ def _final_steps(size: Size, mapping: MappingConfig) -> float:
         min(keyframes + mapping.support_views, size["frames"] / tiles)
         + (tiles > 1) * mapping.border_keyframes
     )
-    return tiles * mapping.final_steps(keyframes, views, USUAL_DEPTH)
+    return tiles * mapping.final_steps(keyframes, views, depth_of(size))
+
+
+def _step_s(cost: tuple[float, float], size: Size, mapping: MappingConfig) -> float:
+    """Time of a step in a map of one tile."""
+    of_tile = size["pixels"] * size["keyframes"] / _tiles(size, mapping)
+    gaussians = min(GAUSSIANS_OF_PIXELS * of_tile, mapping.max_gaussians)
+    return (cost[0] * gaussians + cost[1] * size["pixels"]) * 1e-6
 
 
 def _tiles(size: Size, mapping: MappingConfig) -> int:
@@ -221,7 +246,7 @@ def _tiles(size: Size, mapping: MappingConfig) -> int:
 
 def _longer(most: float, size: Size, mapping: MappingConfig) -> float:
     """Time of a step in a map of some tiles relative to that in one of a single tile; `most` in one of many."""
-    return 1 + (most - 1) * (1 - 1 / _tiles(size, mapping))
+    return 1 + (most - 1) * min((_tiles(size, mapping) - 1) / (MANY_TILES - 1), 1)
 
 
 def _trained_views(size: Size, config: FinetuneConfig) -> int:

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 from duagc.pipeline.cache import durations
 
-TRUSTED_S = 1.0
+TRUSTED_S = 0.5
 """So many predicted seconds count for the prediction: the first steps say little."""
-TRUSTED_PART_S = 0.5
+TRUSTED_PART_S = 0.25
 """The same of a part, for what its whole work takes."""
 START = "start"
 """The part of a work that ends with the first step of another: a process starts."""

@@ -11,9 +11,10 @@ import numpy as np
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks import estimate, geometry, gyroscope, images, measured, scale, stamps
 from duagc.pipeline.checks.findings import Finding, Report, Severity, judged, lines
-from duagc.pipeline.checks.keyframe_count import KeyframeCount, count_keyframes
+from duagc.pipeline.checks.keyframe_count import count_keyframes
 from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
-from duagc.pipeline.config.frontend import FailureConfig, KeyframeConfig
+from duagc.pipeline.config.frontend import FailureConfig, FrontendConfig, KeyframeConfig
+from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import MotionPrior, Recording, RgbdLog, log_metadata, open_rgbd
@@ -83,19 +84,24 @@ def check_registration(log: Path, config: ChecksConfig = _DEFAULT) -> list[Findi
     return list(judged(found, config.sure, config.likely))
 
 
-def expected_keyframes(log: Path, rule: KeyframeConfig, config: ChecksConfig = _DEFAULT) -> KeyframeCount:
-    """About how many keyframes a run will make; a second, before it begins.
+def expected_size(log: Path, config: FrontendConfig, checks: ChecksConfig = _DEFAULT) -> dict[str, int]:
+    """About how many keyframes a run will make, and whether depth is exact; two seconds, before it begins.
 
     Args:
         log: of a robot.
-        rule: when a frame becomes a keyframe.
-        config: from how many places that is estimated.
+        config: of its front end.
+        checks: how many places and pairs are looked at.
 
     Raises:
         DuagError: the log is damaged.
     """
     with open_rgbd(log) as rgbd:
-        return count_keyframes(rgbd, config.keyframes, rule)
+        moved = geometry.moves(rgbd, checks.motion)
+        keyframes = count_keyframes(rgbd, checks.keyframes, config.keyframes)
+    return {
+        "keyframes": keyframes.expected,
+        "exact": int(geometry.has_exact_depth(moved, config.mapping)),
+    }
 
 
 def _unreadable(robot: str, error: DuagError, advice: str) -> Finding:
@@ -142,6 +148,7 @@ def _check_robot(
         "frames": len(log),
         "pixels": log.camera.width * log.camera.height,
         "moved": int(log.needs_motion),
+        "exact": int(geometry.has_exact_depth(moved, MappingConfig())),
         "depth_m": [round(value, 4) for value in sight.depth_m] if sight.known else None,
         "with_depth": round(sight.known, 4),
         "registered_pairs": f"{sum(move.T_first_second is not None for move in moved)} of {len(moved)}",

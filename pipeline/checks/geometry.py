@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from duagc.pipeline.checks.confidence import share_above
 from duagc.pipeline.checks.findings import Finding, Severity
 from duagc.pipeline.checks.images import FEW_FRAMES, Sight
 from duagc.pipeline.config.checks import CameraChecks, EdgeChecks, MotionChecks
+from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import visible
@@ -70,6 +71,7 @@ class Move:
         sigma_m: standard deviation of the length of the translation, by the covariance of the registration.
         turned_rad: angle of the rotation.
         depth_m: median depth of the first frame.
+        depth_rms_m: weighted depth residual of the registration.
         depth_offset_ns: the larger of the two times between color and depth.
     """
 
@@ -80,6 +82,7 @@ class Move:
     sigma_m: float = 0.0
     turned_rad: float = 0.0
     depth_m: float = 0.0
+    depth_rms_m: float = 0.0
     depth_offset_ns: int = 0
 
     @property
@@ -129,6 +132,7 @@ def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> Move:
         sigma_m=_length_sigma_m(result),
         turned_rad=float(se3.distance(np.eye(4), T)[1]),
         depth_m=float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0,
+        depth_rms_m=result.rms_depth_m,
         depth_offset_ns=max(abs(first.depth_offset_ns), abs(second.depth_offset_ns)),
     )
 
@@ -153,6 +157,23 @@ def _moved(first_m: Image, second_m: Image, T_first_second: Array, camera: Pinho
     expected, found = moved[index, 2], second_m[v, u]
     both = found > 0
     return float(np.median(np.abs(found - expected)[both] / expected[both])) if both.any() else np.nan
+
+
+def has_exact_depth(found: Sequence[Move], config: MappingConfig) -> bool:
+    """Whether maps will be made for exact depth, as far as some pairs of frames tell.
+
+    Args:
+        found: the pairs.
+        config: of the maps.
+    """
+    measured = [move for move in found if move.T_first_second is not None and move.depth_rms_m > 0]
+    if not measured:
+        return config.depth_kind(None) == "ray_plane"
+    noise_m, depth_m = (
+        float(np.median(values))
+        for values in ([move.depth_rms_m for move in measured], [move.depth_m for move in measured])
+    )
+    return config.depth_kind(noise_m, depth_m) == "ray_plane"
 
 
 def check_moves(robot: str, found: list[Move], config: MotionChecks) -> Iterator[Finding]:

@@ -114,7 +114,9 @@ def _steering_s(data: SimulatedData, config: RunConfig) -> float:
 def _times(data: SimulatedData, config: RunConfig) -> tuple[float, float]:
     """Of the front ends of a run, and of all that comes after them."""
     keyframes = 1 + data.frames // FRAMES_PER_KEYFRAME
+    depth = config.frontend.mapping.depth_kind(0.0 if data.noise == "none" else None)
     size = {"frames": data.frames, "pixels": data.width * data.height, "keyframes": keyframes}
+    size["exact"] = int(depth == "ray_plane")
     front_s = durations.front_end_s(size, config.frontend.mapping) + durations.information_s(size)
     front_s += _other_tracker_s(size, config.frontend.tracking)
     rest_s = durations.exchange_s([size] * data.robots)
@@ -139,5 +141,5 @@ def _fusion_s(size: durations.Size, config: RunConfig) -> float:
     views = size["keyframes"] + min(mine.support_views, others)
     share = views / (size["keyframes"] + min(MappingConfig().support_views, others))
     trained_s = durations.fusion_s(size) - durations.FUSION_S
-    steps, usual_steps = (config.steps(durations.USUAL_DEPTH).per_view for config in (mine, usual))
+    steps, usual_steps = (config.steps(durations.depth_of(size)).per_view for config in (mine, usual))
     return durations.FUSION_S + trained_s * share * steps / usual_steps

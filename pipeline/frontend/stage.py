@@ -20,6 +20,7 @@ from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.lap_times import LapTimes
+from duagc.pipeline.base.worker_reports import KEYFRAMES
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.training import DepthKind
@@ -103,9 +104,10 @@ def run_frontend(
                 f"{log_path}: found no frame of {size} pixels to begin a map with ({reasons}), "
                 "expected one with depth in enough of them"
             )
-        keyframes = sum(len(submap.keyframes) for submap in tracked.submaps)
-        save.tell("keyframes", keyframes, keyframes)
         noise_m, depth_m = depth_noise_m(tracked.frames), median_depth_m(tracked)
+        depth = config.mapping.depth_kind(noise_m, depth_m)
+        keyframes = sum(len(submap.keyframes) for submap in tracked.submaps)
+        save.tell(KEYFRAMES[depth], keyframes, keyframes)
         of_maps = config.model_copy(update={"mapping": config.mapping.for_depth(depth_m)})
         clock.lap("tracking_s")
         components = save.done(
@@ -122,7 +124,7 @@ def run_frontend(
                 threads=threads,
                 progress=progress,
                 noise_m=noise_m,
-                depth=config.mapping.depth_kind(noise_m, depth_m),
+                depth=depth,
                 clock=clock,
                 checkpoints=save,
             )

@@ -221,6 +221,7 @@ def test_a_sound_recording_raises_no_alarm(sound: Path, tmp_path: Path) -> None:
     assert not report.findings, check.format_report(report)
     assert set(report.robots) == {"alpha", "bravo"}
     assert report.robots["alpha"]["frames"] == FRAMES
+    assert report.robots["alpha"]["exact"] == 0
     assert "nothing found" in check.format_report(report)
     assert check.check(sound).plain() == report.plain()
     again = check.check(planted(sound, tmp_path / "rec", nothing))  # the metadata of the log are lost

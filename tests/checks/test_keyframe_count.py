@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from duagc.pipeline.checks.check import expected_keyframes
+from duagc.pipeline.checks.check import expected_size
 from duagc.pipeline.checks.keyframe_count import KeyframeCount, count_keyframes
 from duagc.pipeline.config.checks import KeyframeChecks
-from duagc.pipeline.config.frontend import KeyframeConfig
+from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.recording import Recording, RgbdFrame
+from duagc.pipeline.recording import Recording, RgbdFrame, open_rgbd
 
 CAMERA = PinholeCamera(160, 120, 160.0, 160.0, 79.5, 59.5)
 FRAMES, PLACES = 300, 12
@@ -74,5 +74,8 @@ def test_frames_without_depth_make_none_and_what_does_not_register_may_make_any(
 
 
 def test_of_a_recording(small_recording: Path) -> None:
-    found = expected_keyframes(Recording(small_recording).log("bravo"), KeyframeConfig())
+    with open_rgbd(Recording(small_recording).log("bravo")) as log:
+        found = count_keyframes(log, KeyframeChecks(), KeyframeConfig())
     assert found.low <= 2 <= found.high < 5  # as `run` makes
+    size = expected_size(Recording(small_recording).log("bravo"), FrontendConfig())
+    assert size == {"keyframes": found.expected, "exact": 1}
