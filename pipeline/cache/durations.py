@@ -51,8 +51,8 @@ SCORED_S, COMPARED_S = (0.004, 0.100), (0.01, 0.38)
 """The same of a render that is scored, and of a view that is compared with the others."""
 SURFACE_S = 2.0
 """Of an evaluation of a robot, for its logs and the true surface."""
-AGREED_S = 1.7
-"""Of a robot that has peers, for what all are measured by together."""
+AGREED_S, TOGETHER_S = 0.3, 0.2
+"""Of a robot for every peer, with whose map its own is compared; and for what all are measured by together."""
 VIEWS, HELD_OUT = 40, 8
 """The most views of a set that are scored, and every so many frames one is held out."""
 RENDERS, KEYFRAME_RENDERS, PEER_RENDERS = 4, 2, 3
@@ -151,7 +151,7 @@ def evaluation_parts(size: Size, robots: int) -> dict[str, float]:
         "training": (read_s + scored_s * KEYFRAME_RENDERS) * keyframes,
         "peers": (read_s + scored_s * PEER_RENDERS) * of_peers,
         "surface": SURFACE_S,
-        "agreement": (read_s + compared_s) * views,
+        "agreement": (read_s + compared_s) * views + AGREED_S * (robots - 1),
     }
 
 
@@ -161,7 +161,7 @@ def evaluation_of_team_s(robots: int) -> float:
     Args:
         robots: of the team.
     """
-    return AGREED_S * robots if robots > 1 else 0.0
+    return TOGETHER_S * robots if robots > 1 else 0.0
 
 
 def evaluation_s(size: Size, robots: int) -> float:
