@@ -74,6 +74,16 @@ def from_log_covariance(vec_log: ArrayLike) -> tuple[Array, Array]:
     return so3.to_quat_wxyz(vectors), 0.5 * values[..., ::-1]
 
 
+def without_negative(matrices: ArrayLike) -> Array:
+    """Symmetric matrices [..., d, d] with zero in the place of negative eigenvalues, such as rounding leaves.
+
+    Args:
+        matrices: [..., d, d], symmetric.
+    """
+    values, vectors = np.linalg.eigh(np.asarray(matrices, dtype=np.float64))
+    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+
+
 def add_covariance(information: ArrayLike, covariance: ArrayLike) -> Array:
     """(W^-1 + C)^-1 for positive semidefinite W and C [..., d, d], either may be singular.
 

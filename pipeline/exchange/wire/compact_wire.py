@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.geometry import spd
 from duagc.pipeline.splat.information import (
     COLOR,
     COLOR_INFORMATION,
@@ -51,6 +52,7 @@ _LARGEST = float(np.finfo(np.float16).max)
 _PIVOT = (
     1e-6  # pivots below this share of the diagonal are rounding of the float32 that came in: no information
 )
+_MISSED = 1e-3  # of the largest entry: by so much a product may differ from its matrix, as float16 does
 
 
 def encode(records: NDArray[Any]) -> NDArray[Any]:
@@ -107,6 +109,18 @@ def _half(values: Array) -> NDArray[np.float16]:
 
 
 def _factor(matrices: Array) -> Array:
+    """L [n, d, d] lower with L L' = M for positive semidefinite M; of others, without their negative eigenvalues.
+
+    Rounding leaves some of these, and a pivot that is hardly above zero then makes a product many times too large.
+    """
+    L = _cholesky(matrices)
+    largest = np.abs(matrices).max(axis=(1, 2), initial=0.0)
+    missed = np.abs(L @ L.swapaxes(-1, -2) - matrices).max(axis=(1, 2), initial=0.0) > _MISSED * largest
+    L[missed] = _cholesky(spd.without_negative(matrices[missed]))
+    return L
+
+
+def _cholesky(matrices: Array) -> Array:
     """L [n, d, d] lower with L L' = M for positive semidefinite M; a column without a sound pivot is zero."""
     n, d, _ = matrices.shape
     L = np.zeros((n, d, d))

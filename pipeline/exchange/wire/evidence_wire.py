@@ -14,6 +14,7 @@ from duagc.pipeline.base.row_blocks import in_blocks
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.exchange.wire.compact_wire import COMPACT, decode, encode
 from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
+from duagc.pipeline.geometry import spd
 from duagc.pipeline.network.packets import (
     EVIDENCE_BYTES,
     EVIDENCE_DOUBLE_BYTES,
@@ -30,13 +31,17 @@ from duagc.pipeline.splat.information import (
     COLOR_INFORMATION,
     INFORMATION_SIZE,
     LOG_COVARIANCE,
+    LOG_COVARIANCE_INFORMATION,
+    MEAN_INFORMATION,
     THETA_SIZE,
     log_covariance_block,
     mean_block,
+    pack_symmetric,
 )
 
 MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
 INDEFINITE_TOLERANCE = 1e-4  # of the largest eigenvalue: rounding of float32
+SENT_TOLERANCE = 0.5 * INDEFINITE_TOLERANCE  # of what is sent, which may be rounded to float32
 MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32
 
 RECORD = np.dtype(
@@ -45,6 +50,7 @@ RECORD = np.dtype(
 RECORD_DOUBLE = np.dtype(
     [("id", "<i8"), ("anchor", "<i4"), ("theta", "<f8", THETA_SIZE), ("information", "<f8", INFORMATION_SIZE)]
 )
+_BLOCKS = (MEAN_INFORMATION, mean_block), (LOG_COVARIANCE_INFORMATION, log_covariance_block)
 # owner, 1 + index of the depth its map was made with, records of the whole message
 _EVIDENCE = struct.Struct("<HHI")
 assert RECORD.itemsize == EVIDENCE_EXACT_BYTES
@@ -60,7 +66,23 @@ def record_dtype(kind: Kind) -> np.dtype[Any]:
 
 def to_body(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
     """Records as a packet of this kind has them. Rounding happens here, once: a body is passed on unchanged."""
-    return in_blocks(encode, records) if kind is Kind.EVIDENCE else records
+    return in_blocks(encode if kind is Kind.EVIDENCE else _possible, records)
+
+
+def _possible(records: NDArray[Any]) -> NDArray[Any]:
+    """Records without the negative eigenvalues of information that receivers would refuse.
+
+    Sums of float32 err by a share of their largest eigenvalue. Once that is bounded by what a robot states of itself,
+    the error may be much of it.
+    """
+    information = records["information"].astype(np.float64)
+    out = records
+    for place, block in _BLOCKS:
+        odd = np.flatnonzero(_indefinite(block(information), SENT_TOLERANCE))
+        if len(odd):
+            out = out.copy() if out is records else out
+            out["information"][odd, place] = pack_symmetric(spd.without_negative(block(information[odd])))
+    return out
 
 
 def from_body(kind: Kind, body: NDArray[Any]) -> NDArray[Any]:
@@ -145,7 +167,11 @@ def check_information(information: Array) -> None:
         raise MalformedError(f"evidence: information beyond {MAX_INFORMATION:g}")
     if information[:, COLOR_INFORMATION.start :].min(initial=0.0) < 0:
         raise MalformedError("evidence: negative information")
-    for block in (mean_block(information), log_covariance_block(information)):
-        values = np.linalg.eigvalsh(block)
-        if (values[:, 0] < -INDEFINITE_TOLERANCE * np.maximum(values[:, -1], 1e-6)).any():
-            raise MalformedError("evidence: indefinite information")
+    if any(_indefinite(block(information), INDEFINITE_TOLERANCE).any() for _, block in _BLOCKS):
+        raise MalformedError("evidence: indefinite information")
+
+
+def _indefinite(matrices: Array, tolerance: float) -> NDArray[np.bool_]:
+    """Which symmetric matrices [n, d, d] have an eigenvalue below zero by a share of their largest."""
+    values = np.linalg.eigvalsh(matrices)
+    return np.asarray(values[:, 0] < -tolerance * np.maximum(values[:, -1], 1e-6))
