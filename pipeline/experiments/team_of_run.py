@@ -15,7 +15,7 @@ from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.experiments.consensus_modes import Team
 from duagc.pipeline.experiments.gaussian_consensus import COORDINATES
 from duagc.pipeline.fusion.association import association_covariance
-from duagc.pipeline.geometry.spd import add_covariance
+from duagc.pipeline.geometry.spd import add_covariance, without_negative
 from duagc.pipeline.network.link_model import neighbors
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.splat.information import LOG_COVARIANCE, pack_information
@@ -56,11 +56,16 @@ def team_of_run(run: RunFolder, topology: str) -> Team:
 
 
 def _with_sampling(e: Evidence, config: FusionConfig) -> Evidence:
-    """(W^-1 + Sigma_assoc)^-1 with half of what two robots' splats are expected to differ by."""
+    """(W^-1 + Sigma_assoc)^-1 with half of what two robots' splats are expected to differ by.
+
+    Without the negative eigenvalues that rounding leaves, as robots send it.
+    """
     spread = association_covariance(e.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
     packed = pack_information(
         add_covariance(e.position_information(), spread + 0.5 * config.scatter_position_m**2 * np.eye(3)),
-        add_covariance(e.shape_information(), 0.5 * config.scatter_log_covariance**2 * np.eye(6)),
+        without_negative(
+            add_covariance(e.shape_information(), 0.5 * config.scatter_log_covariance**2 * np.eye(6))
+        ),
         e.color_information() / (1 + 0.5 * config.scatter_color**2 * e.color_information()),
         e.opacity_information() / (1 + 0.5 * config.scatter_opacity**2 * e.opacity_information()),
     )
