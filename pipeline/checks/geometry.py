@@ -169,10 +169,7 @@ def has_exact_depth(found: Sequence[Move], config: MappingConfig) -> bool:
     measured = [move for move in found if move.T_first_second is not None and move.depth_rms_m > 0]
     if not measured:
         return config.depth_kind(None) == "ray_plane"
-    noise_m, depth_m = (
-        float(np.median(values))
-        for values in ([move.depth_rms_m for move in measured], [move.depth_m for move in measured])
-    )
+    noise_m, depth_m = np.median([(move.depth_rms_m, move.depth_m) for move in measured], axis=0).tolist()
     return config.depth_kind(noise_m, depth_m) == "ray_plane"
 
 
