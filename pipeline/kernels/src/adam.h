@@ -9,6 +9,7 @@ namespace KERNEL_ISA {
 using namespace raster;
 
 constexpr size_t ADAM_ROWS = 16;  // Gaussians at a time: often none of so few was touched
+constexpr size_t ADAM_SPAN = 256;  // rows out of which those that were touched are taken
 
 // The bits of a number but its sign: zero for zeros of both signs alone.
 inline uint32_t magnitude(const float* value) {
@@ -25,19 +26,24 @@ inline bool untouched(const AdamStep& step, size_t begin, size_t end) {
     return any == 0;
 }
 
-// Counts the step of every Gaussian that the view touched; its bias correction, or 0 if it was not touched.
+// Counts the step of a Gaussian that the view touched; its bias correction, or 0 if it was not touched.
+inline float count_step(const AdamStep& step, size_t row) {
+    const size_t at = step.row(row);
+    const float* color = step.d_colors + 3 * row;
+    const uint32_t gradient = magnitude(step.d_opacity_logits + row) | magnitude(color) | magnitude(color + 1) | magnitude(color + 2);
+    if (gradient == 0 || (step.chosen && !step.chosen[at])) return 0.0f;
+    int32_t& count = step.steps[at];
+    count += count < step.longest;
+    return step.corrections[count - 1];
+}
+
+// The same of some Gaussians; whether any was touched.
 inline bool count_steps(const AdamStep& step, size_t begin, size_t end, float* correction) {
     if (untouched(step, begin, end)) return false;
     bool any = false;
     for (size_t row = begin; row < end; row++) {
-        const float* color = step.d_colors + 3 * row;
-        const size_t at = step.row(row);
-        const uint32_t gradient = magnitude(step.d_opacity_logits + row) | magnitude(color) | magnitude(color + 1) | magnitude(color + 2);
-        const bool touched = gradient != 0 && (!step.chosen || step.chosen[at]);
-        int32_t& count = step.steps[at];
-        count += touched && count < step.longest;
-        correction[row - begin] = touched ? step.corrections[count - 1] : 0.0f;
-        any |= touched;
+        correction[row - begin] = count_step(step, row);
+        any |= correction[row - begin] != 0.0f;
     }
     return any;
 }
@@ -53,12 +59,6 @@ inline float size_of(const float* log_scales) {
     float power;
     __builtin_memcpy(&power, &bits, sizeof power);
     return (1.0f + (octaves - whole)) * power;
-}
-
-// Corrections of parameters whose rate is a share of the Gaussian's size.
-inline void times_sizes(const AdamStep& step, size_t begin, size_t end, const float* correction, float* of_size) {
-    for (size_t row = begin; row < end; row++)
-        of_size[row - begin] = correction[row - begin] * size_of(step.log_scales + 3 * step.row(row));
 }
 
 // Source: Kingma and Ba, ICLR 2015, algorithm 1. A function of its own, so that the compiler sees arrays that do not overlap
@@ -80,7 +80,7 @@ NO_INLINE static void step_elements(size_t count, const AdamConstants& constants
 }
 
 template <size_t WIDTH>
-inline void step_all(const AdamArray& array, const AdamConstants& constants, size_t begin, size_t end, const float* correction) {
+inline void step_array(const AdamArray& array, const AdamConstants& constants, size_t begin, size_t end, const float* correction) {
     float of_element[ADAM_ROWS * WIDTH], out[ADAM_ROWS * WIDTH];
     for (size_t row = 0; row < end - begin; row++)
         for (size_t k = 0; k < WIDTH; k++) of_element[row * WIDTH + k] = correction[row];
@@ -90,22 +90,45 @@ inline void step_all(const AdamArray& array, const AdamConstants& constants, siz
     __builtin_memcpy(array.values + start, out, count * sizeof(float));
 }
 
+// A step of Gaussians that follow each other.
+inline void step_all(const AdamStep& step, size_t begin, size_t end) {
+    float correction[ADAM_ROWS], of_size[ADAM_ROWS];
+    if (!count_steps(step, begin, end, correction)) return;
+    for (size_t row = begin; row < end; row++)  // before log-scales change
+        of_size[row - begin] = correction[row - begin] * size_of(step.log_scales + 3 * row);
+    for (const AdamArray& array : step.arrays) {
+        const float* factors = array.of_size ? of_size : correction;
+        if (array.width == 1)
+            step_array<1>(array, step.constants, begin, end, factors);
+        else if (array.width == 3)
+            step_array<3>(array, step.constants, begin, end, factors);
+        else
+            step_array<4>(array, step.constants, begin, end, factors);
+    }
+}
+
+// Gaussians of some rows that the view touched: about one in four.
+struct TouchedRows {
+    size_t count = 0;
+    size_t row[ADAM_ROWS], at[ADAM_ROWS];  // where its gradients are, and where it is
+    float correction[ADAM_ROWS];
+};
+
 template <size_t WIDTH>
-inline void step_rows(const AdamArray& array, const AdamConstants& constants, const int64_t* rows, size_t begin, size_t end,
-                      const float* correction) {
+inline void step_touched(const AdamArray& array, const AdamConstants& constants, const TouchedRows& touched, const float* correction) {
     constexpr size_t MOST = ADAM_ROWS * WIDTH;
-    float of_element[MOST], values[MOST], first[MOST], second[MOST], out[MOST];
-    for (size_t row = begin; row < end; row++) {
-        const size_t from = static_cast<size_t>(rows[row]) * WIDTH, to = (row - begin) * WIDTH;
+    float of_element[MOST], values[MOST], gradients[MOST], first[MOST], second[MOST], out[MOST];
+    for (size_t i = 0; i < touched.count; i++) {
+        const size_t from = touched.at[i] * WIDTH, row = touched.row[i] * WIDTH, to = i * WIDTH;
         for (size_t k = 0; k < WIDTH; k++) {
-            of_element[to + k] = correction[row - begin];
-            values[to + k] = array.values[from + k];
+            of_element[to + k] = correction[i];
+            values[to + k] = array.values[from + k], gradients[to + k] = array.gradients[row + k];
             first[to + k] = array.first[from + k], second[to + k] = array.second[from + k];
         }
     }
-    step_elements((end - begin) * WIDTH, constants, array.rate, of_element, values, array.gradients + begin * WIDTH, first, second, out);
-    for (size_t row = begin; row < end; row++) {
-        const size_t to = static_cast<size_t>(rows[row]) * WIDTH, from = (row - begin) * WIDTH;
+    step_elements(touched.count * WIDTH, constants, array.rate, of_element, values, gradients, first, second, out);
+    for (size_t i = 0; i < touched.count; i++) {
+        const size_t to = touched.at[i] * WIDTH, from = i * WIDTH;
         for (size_t k = 0; k < WIDTH; k++) {
             array.values[to + k] = out[from + k];
             array.first[to + k] = first[from + k], array.second[to + k] = second[from + k];
@@ -113,13 +136,33 @@ inline void step_rows(const AdamArray& array, const AdamConstants& constants, co
     }
 }
 
-template <size_t WIDTH>
-inline void step_some(const AdamArray& array, const AdamConstants& constants, const int64_t* rows, size_t begin, size_t end,
-                      const float* correction) {
-    if (rows)
-        step_rows<WIDTH>(array, constants, rows, begin, end, correction);
-    else
-        step_all<WIDTH>(array, constants, begin, end, correction);
+inline void step_touched(const AdamStep& step, const TouchedRows& touched) {
+    float of_size[ADAM_ROWS];
+    for (size_t i = 0; i < touched.count; i++)  // before log-scales change
+        of_size[i] = touched.correction[i] * size_of(step.log_scales + 3 * touched.at[i]);
+    for (const AdamArray& array : step.arrays) {
+        const float* factors = array.of_size ? of_size : touched.correction;
+        if (array.width == 1)
+            step_touched<1>(array, step.constants, touched, factors);
+        else if (array.width == 3)
+            step_touched<3>(array, step.constants, touched, factors);
+        else
+            step_touched<4>(array, step.constants, touched, factors);
+    }
+}
+
+// A step of the Gaussians of some rows.
+inline void step_rows(const AdamStep& step, size_t begin, size_t end) {
+    TouchedRows touched;
+    for (size_t row = begin; row < end; row++) {
+        const float correction = count_step(step, row);
+        if (correction == 0.0f) continue;
+        touched.row[touched.count] = row, touched.at[touched.count] = step.row(row), touched.correction[touched.count] = correction;
+        if (++touched.count < ADAM_ROWS) continue;
+        step_touched(step, touched);
+        touched.count = 0;
+    }
+    if (touched.count) step_touched(step, touched);
 }
 
 inline float clipped(float value, float least, float greatest) {
@@ -151,24 +194,16 @@ inline void limit(const AdamStep& step, const AdamLimits& limits, size_t begin, 
 
 // What has no row in `rows` or is not chosen stays as it is.
 static void adam(const AdamStep& step, const AdamLimits& limits, int threads) {
-    const int groups = static_cast<int>((step.count + ADAM_ROWS - 1) / ADAM_ROWS);
+    const size_t rows = step.rows ? ADAM_SPAN : ADAM_ROWS;
+    const int groups = static_cast<int>((step.count + rows - 1) / rows);
 #pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
     for (int group = 0; group < groups; group++) {
-        const size_t begin = static_cast<size_t>(group) * ADAM_ROWS;
-        const size_t end = begin + ADAM_ROWS < step.count ? begin + ADAM_ROWS : step.count;
-        float correction[ADAM_ROWS], of_size[ADAM_ROWS];
-        if (count_steps(step, begin, end, correction)) {
-            times_sizes(step, begin, end, correction, of_size);  // before log-scales change
-            for (const AdamArray& array : step.arrays) {
-                const float* factors = array.of_size ? of_size : correction;
-                if (array.width == 1)
-                    step_some<1>(array, step.constants, step.rows, begin, end, factors);
-                else if (array.width == 3)
-                    step_some<3>(array, step.constants, step.rows, begin, end, factors);
-                else
-                    step_some<4>(array, step.constants, step.rows, begin, end, factors);
-            }
-        }
+        const size_t begin = static_cast<size_t>(group) * rows;
+        const size_t end = begin + rows < step.count ? begin + rows : step.count;
+        if (step.rows)
+            step_rows(step, begin, end);
+        else
+            step_all(step, begin, end);
         limit(step, limits, begin, end);
     }
 }
