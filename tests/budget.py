@@ -33,7 +33,7 @@ BUDGET_S = {
     "examples": 15,
     "exchange": 36,
     "experiments": 4,
-    "frontend": 72,
+    "frontend": 84,
     "fusion": 2,
     "fuzz": 10,
     "geometry": 1,

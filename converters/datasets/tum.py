@@ -17,7 +17,7 @@ from pydantic import Field
 from duagc.converters.layouts import image_folder, tum_layout
 from duagc.converters.layouts.image_files import image_size, options_of
 from duagc.converters.layouts.image_folder import Clip
-from duagc.converters.layouts.kinect import kinect_readout
+from duagc.converters.layouts.kinect import kinect_readout, no_readout
 from duagc.converters.robot_writer import check_camera
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
@@ -52,7 +52,8 @@ class Options(tum_layout.SequenceOptions):
     """Take the lens distortion out of color and depth together; without, images stay as they are and a pinhole camera
     does not describe them."""
     rolling_shutter: Literal["auto", "none"] = "auto"
-    """Readout of the images that the log states: auto is that of a first Kinect where the camera is one."""
+    """Readout of the images that the log states: auto is that of a first Kinect where the camera is one, none that all
+    rows are read at once."""
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
@@ -68,8 +69,9 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         warnings.append(
             f"depth is taken as {DEPTH_SCALE} m per unit, as of a Kinect; expected --set depth_scale=METERS"
         )
-    stated = settings.rolling_shutter == "auto" and sensor == KINECT
-    readout = kinect_readout() if stated else {}
+    readout = kinect_readout() if sensor == KINECT else {}
+    if settings.rolling_shutter == "none":
+        readout = no_readout()
     clip = Clip(
         "",
         frames,

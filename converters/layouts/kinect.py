@@ -10,3 +10,8 @@ rows of fr1_desk are taken so is in docs/lab/2026-11-22-rolling-shutter.md."""
 def kinect_readout() -> dict[str, str]:
     """What a log says about the readout of its images."""
     return {COLOR_READOUT_KEY: repr(COLOR_READOUT_S), DEPTH_READOUT_KEY: repr(DEPTH_READOUT_S)}
+
+
+def no_readout() -> dict[str, str]:
+    """The same of images whose rows are all read at once."""
+    return dict.fromkeys((COLOR_READOUT_KEY, DEPTH_READOUT_KEY), "0")

@@ -43,6 +43,7 @@ from duagc.pipeline.frontend.output import (
     submap_messages,
     write_log,
 )
+from duagc.pipeline.frontend.readout_time import certain_readout
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
@@ -53,6 +54,7 @@ from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.recording import MotionPrior, RgbdLog, open_rgbd
 from duagc.pipeline.recording.moved_depth import DELAY_KEY
+from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.pipeline.recording.shutter import FOUND_KEY
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -182,6 +184,10 @@ class _Tracking:
                 f"depth of {log.robot} was taken {1e-6 * delay_ns:.1f} ms before its stamps, and is moved"
             )
             log.delay_depth(delay_ns)
+        if (readout := save.done("readout", lambda: self._readout(first))).rolls:
+            times = f"{1e3 * readout.color_s:.1f} and {1e3 * readout.depth_s:.1f} ms"
+            save.say(f"rows of {log.robot} were read for {times} (color, depth), and are moved")
+            log.readout = readout
         tracked = save.done("tracked", lambda: self._leading(self._again(first)))
         if tracked.submaps[0].keyframes:
             log.move_depth(*trajectories_of(tracked))
@@ -196,6 +202,11 @@ class _Tracking:
         if not tracked.submaps[0].keyframes:
             return 0
         return certain_delay_ns(self.log, trajectories_of(tracked), self.config.delay)
+
+    def _readout(self, tracked: TrackedLog) -> Readout:
+        if not tracked.submaps[0].keyframes:
+            return Readout()
+        return certain_readout(self.log, trajectories_of(tracked), self.config.readout)
 
     def _again(self, tracked: TrackedLog) -> TrackedLog:
         if self.log.needs_motion and tracked.submaps[0].keyframes:
@@ -308,6 +319,8 @@ class _ComponentStage:
         }
         if log.depth_delay_ns:
             notes[DELAY_KEY] = str(log.depth_delay_ns)
+        if log.readout.rolls and not log.states_readout:
+            notes |= log.readout.notes()
         if built.shutter_s > 0:
             notes[FOUND_KEY] = repr(built.shutter_s)
         odometry = [odometry_message(self.name, frame, refined.T_map_keyframe) for frame in built.frames]

@@ -42,8 +42,6 @@ from duagc.pipeline.messages import (
     RejectedMatches,
 )
 from duagc.pipeline.recording import LogWriter, open_rgbd, read_exposures, read_log
-from duagc.pipeline.recording.moved_depth import depth_delay_ns
-from duagc.pipeline.recording.shutter import found_shutter_s
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -284,9 +282,7 @@ def training_views(
     between = training_frames(path, others, count, seen_m)
     exposures = read_exposures(source.frontend, source.robot)
     with open_rgbd(source.log) as log:
-        log.delay_depth(depth_delay_ns(source.frontend))
-        log.move_depth(path)
-        log.open_shutter(found_shutter_s(source.frontend), path)
+        log.move_depth_by(source.frontend, path)
         free = FreeSpace(log.camera, moving)
 
         def posed(k: int) -> PosedRgbd:

@@ -39,6 +39,7 @@ class DepthMotion:
             parts: T_map_camera of the tracked frames; of every part that has a frame of its own.
         """
         self._parts = parts
+        self._curves: dict[int, Array | None] = {}  # by the time of a frame
 
     def between(self, color_ns: int, depth_ns: int) -> Array | None:
         """T_color_depth [4, 4], from the camera when depth was taken to the camera when color was.
@@ -63,15 +64,25 @@ class DepthMotion:
         Returns:
             The motions; None where the poses do not say.
         """
+        if color_ns not in self._curves:
+            self._curves[color_ns] = self._curve(color_ns)
+        curve = self._curves[color_ns]
+        if curve is None:
+            return None
+        then = np.vander(1e-9 * (times_ns - color_ns), len(curve)) @ curve
+        return np.asarray(se3.inverse(se3.exp(curve[-1])) @ se3.exp(then))
+
+    def _curve(self, color_ns: int) -> Array | None:
+        """The curve around a frame."""
         for part in self._parts:
             at = int(np.searchsorted(part.stamps_ns, color_ns))
             if at < len(part.stamps_ns) and part.stamps_ns[at] == color_ns:
-                return _motion_in(part, at, times_ns - color_ns)
+                return _curve_in(part, at)
         return None
 
 
-def _motion_in(part: Trajectory, at: int, durations_ns: NDArray[np.int64]) -> Array | None:
-    """Motions [n, 4, 4] of the camera in some times from a frame; None without other frames near it."""
+def _curve_in(part: Trajectory, at: int) -> Array | None:
+    """Tangents from a frame as a polynomial of seconds, [degree + 1, 6]; None without other frames near it."""
     offsets_ns = part.stamps_ns - part.stamps_ns[at]
     near = np.flatnonzero(np.abs(offsets_ns) <= REACH_NS)
     first = max(int(np.searchsorted(near, at)) - FRAMES_AROUND, 0)
@@ -82,9 +93,7 @@ def _motion_in(part: Trajectory, at: int, durations_ns: NDArray[np.int64]) -> Ar
     seconds = 1e-9 * offsets_ns[chosen]
     motions = se3.log(se3.inverse(part.poses[at]) @ part.poses[chosen])
     degree = 2 if len(chosen) > 3 else 1
-    curve = np.linalg.lstsq(np.vander(seconds, degree + 1), motions, rcond=None)[0]
-    then = np.vander(1e-9 * durations_ns, degree + 1) @ curve
-    return np.asarray(se3.inverse(se3.exp(curve[-1])) @ se3.exp(then))
+    return np.asarray(np.linalg.lstsq(np.vander(seconds, degree + 1), motions, rcond=None)[0])
 
 
 def depth_delay_ns(frontend: Path) -> int:

@@ -22,9 +22,11 @@ from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, mo
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile, Record
 from duagc.pipeline.recording.rgbd_frame import RgbdFrame
-from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, row_times_ns
+from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, all_rows, known_rows, row_times_ns
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.schemas import topics as topic_table
+
+SHORT_PERCENTILE = 10  # of the times between images
 
 
 @dataclass(frozen=True)
@@ -35,12 +37,14 @@ class _Geometry:
         depth: in the time of the color if `depth_moved`; not yet 0 where the camera never shows the scene.
         depth_moved: as of `RgbdFrame`.
         mask: bool [H, W], pixels of the still image that may be used; None: all.
+        masked: whether the image as it was read has a mask; if not, only its border may be missing from the still one.
         color_unrolling: makes the color still; None: it is.
     """
 
     depth: DepthImage
     depth_moved: bool
     mask: NDArray[np.bool_] | None
+    masked: bool
     color_unrolling: Unrolling | None
 
 
@@ -53,7 +57,7 @@ class RgbdLog:
     to all of them.
 
     `robot`, `camera`, `depth_scale` (meters per unit), `valid` (bool [H, W], pixels that show the scene; None = all),
-    `depth_delay_ns` (of `delay_depth`), `readout` (how long images are read, as the log states it),
+    `depth_delay_ns` (of `delay_depth`), `readout` (how long images are read, as the log states it, or as it was found),
     `stated_shutter_s` (how long the shutter is open, seconds, if it states that), `shutter` (of `open_shutter`).
     Reads what is asked for and keeps no more than a few frames.
     """
@@ -95,7 +99,8 @@ class RgbdLog:
         self.pairing = pair(self._color_at, self._depth_at)
         self.depth_delay_ns = 0
         written = dict(self._log.metadata()).get(LOG_RECORD, {})
-        self.readout = Readout.stated(written, str(self.path))
+        self._stated_readout = Readout.stated(written, str(self.path))
+        self.readout = self._stated_readout or Readout()
         self.stated_shutter_s = stated_shutter_s(written, str(self.path))
         self._motion: DepthMotion | None = None
         self.shutter: OpenShutter | None = None
@@ -200,6 +205,17 @@ class RgbdLog:
         return 0 if depth is None else depth - color
 
     @property
+    def states_readout(self) -> bool:
+        """Whether the log says how long its images are read."""
+        return self._stated_readout is not None
+
+    @property
+    def shortest_interval_ns(self) -> int:
+        """Time between images; where some are missing, between those that follow each other most closely."""
+        stamps = [color for color, _ in self.pairing.pairs]
+        return int(np.percentile(np.diff(stamps), SHORT_PERCENTILE)) if len(stamps) > 1 else 0
+
+    @property
     def needs_motion(self) -> bool:
         """Whether some depth, or some row, is of another time than its color."""
         return bool(self.pairing.largest_offset_ns) or self.readout.rolls
@@ -222,16 +238,18 @@ class RgbdLog:
         """
         self.shutter = OpenShutter(shutter_s, DepthMotion(*parts)) if shutter_s > 0 else None
 
-    def move_depth_by(self, frontend: Path) -> None:
-        """`delay_depth`, `move_depth` and `open_shutter` by what the front end found.
+    def move_depth_by(self, frontend: Path, path: Trajectory | None = None) -> None:
+        """`delay_depth`, `readout`, `move_depth` and `open_shutter` by what the front end found.
 
         Args:
-            frontend: frontend.mcap of the robot; poses are read only if they are needed.
+            frontend: frontend.mcap of the robot.
+            path: T_map_camera of the frames that it tracked; None: read if they are needed.
         """
         self.delay_depth(depth_delay_ns(frontend))
+        self.readout = self._stated_readout or Readout.found(frontend) or Readout()
         shutter_s = found_shutter_s(frontend)
         if self.needs_motion or shutter_s > 0:
-            path = tracked_frames(frontend)
+            path = tracked_frames(frontend) if path is None else path
             self.move_depth(path)
             self.open_shutter(shutter_s, path)
 
@@ -263,7 +281,7 @@ class RgbdLog:
         return RgbdFrame(
             index,
             stamp,
-            image if mask is None else masks.filled(image, mask),
+            image if mask is None or not geometry.masked else masks.filled(image, mask),
             self._of_scene(found.depth_m),
             mask=mask,
             depth_offset_ns=self.frame_offset_ns(index),
@@ -301,7 +319,8 @@ class RgbdLog:
         mask = self._mask_of(color_ns)
         depth, moved = self._depth_of(color_ns, depth_ns)
         unrolling = self._unrolling(color_ns, color_ns, self.readout.color_s, depth)
-        return _Geometry(depth, moved, mask if unrolling is None else unrolling.usable(mask), unrolling)
+        usable = mask if unrolling is None else unrolling.usable(mask)
+        return _Geometry(depth, moved, usable, mask is not None, unrolling)
 
     def _depth_of(self, color_ns: int, depth_ns: int | None) -> tuple[DepthImage, bool]:
         """The depth of a frame, and whether it was moved into the time of the color."""
@@ -320,19 +339,35 @@ class RgbdLog:
         seen = DepthImage(self._of_scene(found.depth_m), found.sigma_m)
         return move_depth(seen, self.camera, T_color_depth), True
 
+    def moved_rows_px(self, index: int) -> float:
+        """How far the median pixel of a frame, as it was read, lies from where a still camera has it.
+
+        Args:
+            index: position in the log, 0 <= index < len(self).
+        """
+        stamp, depth_stamp = self._stamps(index)
+        depth, _ = self._depth_of(stamp, depth_stamp)
+        found = [self._rolling(stamp, stamp, s, depth) for s in (self.readout.color_s, self.readout.depth_s)]
+        return max((rolling.move_px for rolling in found if rolling is not None), default=0.0)
+
     def _unrolling(
         self, color_ns: int, taken_ns: int, readout_s: float, depth: DepthImage
     ) -> Unrolling | None:
         """How an image that was read around a time is made still; None where it is, or no pose says how it moved."""
+        found = self._rolling(color_ns, taken_ns, readout_s, depth)
+        return None if found is None or not found.is_needed else found
+
+    def _rolling(self, color_ns: int, taken_ns: int, readout_s: float, depth: DepthImage) -> Unrolling | None:
+        """The same of any image whose rows are of different times."""
         if self._motion is None or readout_s == 0:
             return None
-        rows_ns = taken_ns + row_times_ns(self.camera.height, readout_s)
+        height = self.camera.height
+        rows_ns = taken_ns + row_times_ns(known_rows(height), height, readout_s)
         T_color_then = self._motion.at(color_ns, np.append(rows_ns, taken_ns))
         if T_color_then is None:
             return None
-        T_middle_row = se3.inverse(T_color_then[-1]) @ T_color_then[:-1]
-        found = Unrolling(self.camera, T_middle_row, depth.depth_m)
-        return found if found.is_needed else None
+        T_middle_row = all_rows(se3.inverse(T_color_then[-1]) @ T_color_then[:-1], height)
+        return Unrolling(self.camera, T_middle_row, depth.depth_m)
 
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [H, W] with 0 where the camera never shows the scene."""

@@ -3,7 +3,7 @@
 A rolling shutter reads a row at a time: while the camera turns at 60 degrees a second and is read for 26 ms, the last
 row sees the scene 1.6 degrees away from where the first row would have. A log may state how long its images are read
 (`COLOR_READOUT_KEY`, `DEPTH_READOUT_KEY`); with the motion of the tracked camera every pixel is then looked up in the
-row that saw its point.
+row that saw its point. Where a log states nothing, the front end finds it (`frontend.readout_time`).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +22,16 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording.depth_sources import DepthImage
+from duagc.pipeline.recording.read import log_metadata
 
 Image = NDArray[np.float32]
 COLOR_READOUT_KEY, DEPTH_READOUT_KEY = "rolling_shutter_s", "depth_rolling_shutter_s"
-"""In the metadata of a log: seconds from the first to the last row of an image, the stamp in the middle of them."""
+"""In the metadata of a log: seconds from the first to the last row of an image, the stamp in the middle of them; in
+that of a front end's log, as it found them, negative where the last row was read first."""
 LONGEST_S = 0.2
 LEAST_MOVE_PX = 0.25  # of a pixel between the middle row and its own: less is not worth to interpolate for
 STEP_PX = 16  # between the pixels whose motion is computed; that of the others is interpolated
+ROWS_APART = 8  # between the rows whose poses are computed; those of the others are interpolated
 SAMPLE_PX = 4  # between the depths that a mean over a neighborhood is taken of
 ROUNDS = 3  # of looking up the row of a pixel; each brings it nearer by as much as the motion changes by row
 
@@ -45,8 +49,8 @@ class Readout:
     depth_s: float = 0.0
 
     @staticmethod
-    def stated(metadata: Mapping[str, str], where: str) -> Readout:
-        """As the metadata of a log states it.
+    def stated(metadata: Mapping[str, str], where: str) -> Readout | None:
+        """As the metadata of a log states it; None if they do not.
 
         Args:
             metadata: of the log.
@@ -55,32 +59,83 @@ class Readout:
         Raises:
             DuagError: a time that no camera takes.
         """
-        found: list[float] = []
-        for key in (COLOR_READOUT_KEY, DEPTH_READOUT_KEY):
-            text = metadata.get(key, "0")
-            try:
-                seconds = float(text)
-            except ValueError:
-                seconds = math.nan
-            if not 0 <= seconds <= LONGEST_S:
-                raise DuagError(f"{where}: {key} is {text!r}, expected 0 to {LONGEST_S:g} seconds")
-            found.append(seconds)
-        return Readout(*found)
+        if COLOR_READOUT_KEY not in metadata and DEPTH_READOUT_KEY not in metadata:
+            return None
+        return Readout(
+            *(_seconds(metadata, key, where, 0.0) for key in (COLOR_READOUT_KEY, DEPTH_READOUT_KEY))
+        )
+
+    @staticmethod
+    def found(frontend: Path) -> Readout | None:
+        """As a front end found it; None where the log states it, or nothing was certain.
+
+        Args:
+            frontend: frontend.mcap of a robot, or of a component.
+
+        Raises:
+            DuagError: a time that no camera takes.
+        """
+        metadata = log_metadata(frontend)
+        if COLOR_READOUT_KEY not in metadata:
+            return None
+        keys = COLOR_READOUT_KEY, DEPTH_READOUT_KEY
+        return Readout(*(_seconds(metadata, key, str(frontend), -LONGEST_S) for key in keys))
+
+    def notes(self) -> dict[str, str]:
+        """For the metadata of a front end's log."""
+        return {COLOR_READOUT_KEY: repr(self.color_s), DEPTH_READOUT_KEY: repr(self.depth_s)}
 
     @property
     def rolls(self) -> bool:
         """Whether rows are read one after the other."""
-        return self.color_s > 0 or self.depth_s > 0
+        return self.color_s != 0 or self.depth_s != 0
 
 
-def row_times_ns(height: int, readout_s: float) -> NDArray[np.int64]:
-    """Times [h] of the rows of an image from that of its middle.
+def _seconds(metadata: Mapping[str, str], key: str, where: str, least_s: float) -> float:
+    text = metadata.get(key, "0")
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not least_s <= seconds <= LONGEST_S:
+        raise DuagError(f"{where}: {key} is {text!r}, expected {least_s:g} to {LONGEST_S:g} seconds")
+    return seconds
+
+
+def known_rows(height: int) -> NDArray[np.int64]:
+    """Rows of an image whose poses are computed.
 
     Args:
         height: of the image.
+    """
+    return np.unique(np.r_[np.arange(0, height, ROWS_APART), height - 1])
+
+
+def row_times_ns(rows: NDArray[np.int64], height: int, readout_s: float) -> NDArray[np.int64]:
+    """Times of rows of an image from that of its middle.
+
+    Args:
+        rows: which.
+        height: of the image.
         readout_s: from the first to the last row.
     """
-    return np.rint(1e9 * readout_s * (np.arange(height) / max(height - 1, 1) - 0.5)).astype(np.int64)
+    return np.rint(1e9 * readout_s * (rows / max(height - 1, 1) - 0.5)).astype(np.int64)
+
+
+def all_rows(T_middle_row: Array, height: int) -> Array:
+    """Poses [h, 4, 4] of all rows, by those of `known_rows`: elements in between are interpolated.
+
+    Args:
+        T_middle_row: [k, 4, 4].
+        height: of the image.
+    """
+    known, rows = known_rows(height), np.arange(height)
+    after = np.clip(np.searchsorted(known, rows), 1, max(len(known) - 1, 1))
+    before = after - 1 if len(known) > 1 else after * 0
+    after = np.minimum(after, len(known) - 1)
+    share = (rows - known[before]) / np.maximum(known[after] - known[before], 1)
+    share = share[:, None, None]
+    return np.asarray((1 - share) * T_middle_row[before] + share * T_middle_row[after])
 
 
 class Unrolling:
@@ -96,7 +151,7 @@ class Unrolling:
         """
         self._camera, self._T_row_middle = camera, se3.inverse(T_middle_row)
         rows, columns = _steps(camera.height), _steps(camera.width)
-        u, v = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
+        u, v = np.meshgrid(columns, rows)
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         points = rays / _mean_inverse(depth_m, rows, columns)[..., None]
         found_u, found_v = u, v
@@ -134,10 +189,13 @@ class Unrolling:
         """
         import cv2
 
-        shown = np.ones((self._camera.height, self._camera.width), np.float32)
+        camera = self._camera
+        inside = cv2.inRange(self._u, 0.0, camera.width - 1.0), cv2.inRange(self._v, 0.0, camera.height - 1.0)
+        shown = cv2.bitwise_and(*inside)
         if mask is not None:
-            shown = mask.astype(np.float32)
-        return np.asarray(cv2.remap(shown, self._u, self._v, cv2.INTER_LINEAR) > 0.999)
+            usable = cv2.remap(mask.astype(np.float32), self._u, self._v, cv2.INTER_LINEAR)
+            shown = cv2.bitwise_and(shown, cv2.inRange(usable, 0.999, 2.0))
+        return np.asarray(shown > 0)
 
     def depth(self, depth: DepthImage) -> DepthImage:
         """Depth along z of the camera in the middle of the readout; that of the nearest pixel, which mixes no surfaces.
@@ -163,36 +221,31 @@ class Unrolling:
         return DepthImage(found, sigma)
 
 
-def _steps(size: int) -> NDArray[np.int64]:
-    """Rows or columns whose motion is computed."""
-    return np.unique(np.r_[np.arange(0, size, STEP_PX), size - 1])
+def _steps(size: int) -> Array:
+    """Rows or columns whose motion is computed: as `cv2.resize` takes them, from one beyond either border."""
+    count = -(-(size + STEP_PX // 2) // STEP_PX) + 1
+    return np.asarray(STEP_PX * (np.arange(count, dtype=np.float64) - 0.5) - 0.5)
 
 
 @lru_cache(maxsize=4)
-def _grids(height: int, width: int) -> tuple[tuple[Image, Image], tuple[Image, Image]]:
-    """Columns and rows [h, w] of all pixels, and where these are among those whose motion is computed."""
-    sizes = width, height
-    at = [np.interp(np.arange(n), _steps(n), np.arange(len(_steps(n)))) for n in sizes]
-    pixels, steps = (
-        np.meshgrid(*(values.astype(np.float32) for values in two))
-        for two in ([np.arange(n) for n in sizes], at)
-    )
-    return (pixels[0], pixels[1]), (steps[0], steps[1])
+def _pixels(height: int, width: int) -> tuple[Image, Image]:
+    """Columns [1, w] and rows [h, 1] of all pixels."""
+    return np.arange(width, dtype=np.float32)[None], np.arange(height, dtype=np.float32)[:, None]
 
 
 def _interpolated(moved: Image, height: int, width: int) -> tuple[Image, Image]:
     """Columns and rows [h, w] in the rolling image of all pixels, by the motion [k, l, 2] of some."""
     import cv2
 
-    pixels, steps = _grids(height, width)
+    size = moved.shape[1] * STEP_PX, moved.shape[0] * STEP_PX
     found = [
-        whole + cv2.remap(part, *steps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for whole, part in zip(pixels, cv2.split(moved), strict=True)
+        whole + cv2.resize(part, size, interpolation=cv2.INTER_LINEAR)[STEP_PX:, STEP_PX:][:height, :width]
+        for whole, part in zip(_pixels(height, width), cv2.split(moved), strict=True)
     ]
     return found[0], found[1]
 
 
-def _mean_inverse(depth_m: Image, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Array:
+def _mean_inverse(depth_m: Image, rows: Array, columns: Array) -> Array:
     """Mean inverse depth around some pixels; where there is none that of the image, and of 1 m without any."""
     import cv2
 
@@ -203,5 +256,9 @@ def _mean_inverse(depth_m: Image, rows: NDArray[np.int64], columns: NDArray[np.i
     share = cv2.blur(known.astype(np.float32), side)
     mean = cv2.blur(inverse, side) / np.maximum(share, 1e-6)
     middle = float(np.median(inverse[known])) if known.any() else 1.0
-    around = np.ix_(rows // SAMPLE_PX, columns // SAMPLE_PX)
+    places = [
+        np.clip(at / SAMPLE_PX, 0, count - 1).astype(np.int64)
+        for at, count in zip((rows, columns), mean.shape, strict=True)
+    ]
+    around = np.ix_(*places)
     return np.where(share > 0.05, mean, middle)[around].astype(np.float64)

@@ -9,7 +9,8 @@ import pytest
 
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import DelayConfig, FrontendConfig, TrackingConfig
-from duagc.pipeline.frontend.depth_delay import MotionDifference, certain_delay_ns, estimated_delay
+from duagc.pipeline.frontend.depth_delay import certain_delay_ns
+from duagc.pipeline.frontend.motion_differences import MotionDifference, estimated_time
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import Trajectory
@@ -113,7 +114,7 @@ def test_the_front_end_moves_depth_by_it(logs: dict[int, Path], tmp_path: Path) 
 
 def test_pairs_that_tell_nothing_leave_it_open() -> None:
     nothing = [replace(d, information=np.zeros((6, 6))) for d in differences(0.02, np.zeros(6))]
-    found = estimated_delay(nothing, CONFIG)
+    found = estimated_time(nothing, CONFIG)
     assert found is not None
     assert found.sigma_s == pytest.approx(1.0)
 
@@ -133,10 +134,10 @@ def differences(delay_s: float, turned: np.ndarray, wrong: int = 0) -> list[Moti
 
 def test_wrong_pairs_and_a_turned_camera_are_no_delay() -> None:
     turned = np.array([0.01, -0.005, 0.0, 0.02, -0.01, 0.01])
-    found = estimated_delay(differences(0.02, turned, wrong=8), CONFIG)
+    found = estimated_time(differences(0.02, turned, wrong=8), CONFIG)
     assert found is not None
-    assert found.delay_s == pytest.approx(0.02, abs=1e-3)
+    assert found.time_s == pytest.approx(0.02, abs=1e-3)
     assert found.sigma_s < 0.002
-    found = estimated_delay(differences(0.0, turned), CONFIG)
+    found = estimated_time(differences(0.0, turned), CONFIG)
     assert found is not None
-    assert abs(found.delay_s) < 1e-3
+    assert abs(found.time_s) < 1e-3

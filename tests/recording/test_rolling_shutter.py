@@ -36,7 +36,7 @@ def poses(times_s: np.ndarray) -> np.ndarray:
 
 
 def rows(middle_s: float) -> np.ndarray:
-    return poses(middle_s + 1e-9 * row_times_ns(CAMERA.height, READOUT_S))
+    return poses(middle_s + 1e-9 * row_times_ns(np.arange(CAMERA.height), CAMERA.height, READOUT_S))
 
 
 def still(middle_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +95,7 @@ def test_a_readout_that_no_camera_has_is_refused(text: str) -> None:
 def test_each_camera_states_its_own_readout() -> None:
     assert Readout.stated({"rolling_shutter_s": "0.02"}, "") == Readout(0.02, 0.0)
     assert Readout.stated({"depth_rolling_shutter_s": "0.03"}, "") == Readout(0.0, 0.03)
-    assert not Readout.stated({}, "").rolls
+    assert Readout.stated({}, "") is None
 
 
 @pytest.mark.parametrize("stated", [True, False])

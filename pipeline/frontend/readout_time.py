@@ -1,0 +1,184 @@
+"""How long the images of a log are read, row after row, where it does not state it: by motions that halves of them see.
+
+Two frames are registered by the upper half of the first one alone, and by the lower half alone; by color for the color
+camera, by depth for the depth camera. With a readout r the rows of a half were taken r a after the middle of the first
+image, a its mean place from -1/2 to 1/2, and their points r b after that of the second. Where the camera has the
+velocities v and w (right tangents per second), the two motions then differ by r (db w - da Ad v), db and da being
+the differences of b and a between the halves (`motion_differences`). Where the velocity does not change, a readout
+cannot be told from another lens, and harms as little.
+
+In images that what was found has made still, what is left is looked for again, until it may be chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.frontend import ReadoutConfig
+from duagc.pipeline.config.registration import RegistrationConfig
+from duagc.pipeline.frontend.frame_images import pyramid_of
+from duagc.pipeline.frontend.motion_differences import (
+    BY_COLOR,
+    BY_DEPTH,
+    LEVELS,
+    MEASURED,
+    STRIDES,
+    FoundTime,
+    MotionDifference,
+    MovingView,
+    estimated_time,
+    has_sigma,
+    joint_information,
+    view_pairs,
+)
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.projection import back_project, visible
+from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording import RgbdFrame, RgbdLog
+from duagc.pipeline.recording.rolling_shutter import LONGEST_S, Readout
+from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
+
+KINDS = (BY_COLOR, BY_DEPTH)
+STEP_PX = 8  # between the pixels by which the rows of a half are averaged
+CHANCE_SIGMAS = 2.0  # of what is left, below which it is chance
+MOVED_FRAMES = 20  # by which it is known how far rows move
+LEAST_POINTS = 50  # of a half that both frames see
+
+
+@dataclass(frozen=True)
+class _Half:
+    """The upper or lower half of an image, seen by another one.
+
+    Attributes:
+        pyramid: of the image with the depth of this half alone.
+        place: mean row of its points in the image, as a share of its height, from -1/2 to 1/2.
+        place_seen: the same in the other image.
+    """
+
+    pyramid: RgbdPyramid
+    place: float
+    place_seen: float
+
+
+def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutConfig) -> Readout:
+    """How long color and depth are read, each if it is certain and long enough to matter; else 0.
+
+    Nothing is looked for where the log states a readout, or has sigma of every depth: such depth is computed from
+    images or sweeps, and its errors look alike in views that are near each other.
+
+    Args:
+        log: its images as they were read.
+        parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
+        config: of the estimate.
+    """
+    if not config.enabled or log.states_readout or has_sigma(log):
+        return Readout()
+    longest_s = min(LONGEST_S, 1e-9 * log.shortest_interval_ns)
+    if _moved(log, Readout(longest_s, longest_s), parts) < config.least_move:
+        return Readout()
+    readout = _found(log, list(view_pairs(log, parts, config.pairs)), config, longest_s)
+    return readout if _moved(log, readout, parts) >= config.least_move else Readout()
+
+
+def _moved(log: RgbdLog, readout: Readout, parts: Sequence[Trajectory]) -> float:
+    """How far the rows of the median frame move in such a time, in its median pixel, as a share of its width."""
+    log.readout = readout
+    log.move_depth(*parts)
+    some = evenly_spaced(len(log), min(MOVED_FRAMES, len(log)))
+    moved_px = float(np.median([log.moved_rows_px(index) for index in some]))
+    log.readout = Readout()
+    return moved_px / log.camera.width
+
+
+def _found(
+    log: RgbdLog, pairs: Sequence[tuple[MovingView, MovingView]], config: ReadoutConfig, longest_s: float
+) -> Readout:
+    """What is certain of the readout."""
+    found = _estimated(log, pairs, config)
+    certain = [time is not None and time.is_certain(config) for time in found]
+    times_s = [0.0, 0.0]
+    for number in range(config.rounds if any(certain) else 0):
+        if number:
+            log.readout = Readout(*times_s)
+            found = _estimated(log, pairs, config)
+        left_s = [_left_s(time) if known else 0.0 for known, time in zip(certain, found, strict=True)]
+        times_s = [
+            float(np.clip(sum(two), -longest_s, longest_s)) for two in zip(times_s, left_s, strict=True)
+        ]
+    return Readout(*times_s)
+
+
+def _left_s(time: FoundTime | None) -> float:
+    """What is left of a readout; 0 if it may be chance."""
+    return time.time_s if time is not None and abs(time.time_s) > CHANCE_SIGMAS * time.sigma_s else 0.0
+
+
+def _estimated(
+    log: RgbdLog, pairs: Sequence[tuple[MovingView, MovingView]], config: ReadoutConfig
+) -> list[FoundTime | None]:
+    """What is left of the readout of color and of depth; None where too few pairs tell."""
+    found: tuple[list[MotionDifference], ...] = [], []
+    for first, second in pairs:
+        seen, other = log.frame(first.index), log.frame(second.index)
+        T_start = first.pose_of(second)
+        halves = [_half(log, seen, T_start, lower=lower) for lower in (False, True)]
+        target = RgbdPyramid(pyramid_of(other, log.camera, LEVELS).levels[1:])
+        for kind, of_kind in zip(KINDS, found, strict=True):
+            if (difference := _difference(first, second, halves, target, kind)) is not None:
+                of_kind.append(difference)
+    return [estimated_time(of_kind, config) for of_kind in found]
+
+
+def _half(log: RgbdLog, frame: RgbdFrame, T_frame_other: Array, *, lower: bool) -> _Half | None:
+    """A half of a frame; None if the other frame sees hardly any of it."""
+    height, camera = log.camera.height, log.camera
+    depth_m = frame.depth.copy()
+    depth_m[slice(None, height // 2) if lower else slice(height // 2, None)] = 0
+    v, u = np.nonzero(depth_m[::STEP_PX, ::STEP_PX])
+    v, u = STEP_PX * v, STEP_PX * u
+    points = se3.transform(se3.inverse(T_frame_other), back_project(camera, u, v, depth_m[v, u]))
+    index, _, row = visible(camera, points)
+    if len(index) < LEAST_POINTS:
+        return None
+    pyramid = pyramid_of(replace(frame, depth=depth_m), camera, LEVELS)
+    return _Half(RgbdPyramid(pyramid.levels[1:]), _place(v[index], height), _place(row, height))
+
+
+def _place(rows: NDArray[np.int64], height: int) -> float:
+    return float(np.mean(rows)) / max(height - 1, 1) - 0.5
+
+
+def _difference(
+    first: MovingView,
+    second: MovingView,
+    halves: Sequence[_Half | None],
+    target: RgbdPyramid,
+    kind: RegistrationConfig,
+) -> MotionDifference | None:
+    """The difference of a pair; None if the motion of either half cannot be found."""
+    T_start = first.pose_of(second)
+    target = target.without_depth() if kind is BY_COLOR else target
+    found: list[tuple[_Half, Registration]] = []
+    for half in halves:
+        if half is None:
+            return None
+        registered = register(Reference.from_pyramid(half.pyramid, STRIDES), target, T_start, kind)
+        if registered.outcome not in MEASURED:
+            return None
+        found.append((half, registered))
+    (upper, by_upper), (lower, by_lower) = found
+    T = by_upper.T_reference_target
+    Ad = se3.adjoint(se3.inverse(T))
+    here, there = lower.place - upper.place, lower.place_seen - upper.place_seen
+    return MotionDifference(
+        se3.log(se3.inverse(T) @ by_lower.T_reference_target),
+        there * second.velocity - here * (Ad @ first.velocity),
+        np.eye(6) - Ad,
+        joint_information(by_upper.information, by_lower.information),
+    )

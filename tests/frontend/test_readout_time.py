@@ -1,0 +1,139 @@
+"""Images that were read row after row, of a log that does not say so: the readout is found where it is certain."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.config.frontend import FrontendConfig, ReadoutConfig, TrackingConfig
+from duagc.pipeline.frontend.readout_time import certain_readout
+from duagc.pipeline.frontend.stage import run_frontend
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording import open_rgbd, read_log
+from duagc.pipeline.recording.rolling_shutter import COLOR_READOUT_KEY, Readout, row_times_ns
+from duagc.schemas import topics
+from tests.fixtures.room import pose, render
+
+CAMERA = PinholeCamera(240, 180, 195.0, 195.0, 119.5, 89.5)
+FRAMES, FRAME_NS = 56, 33_333_333
+READOUT_S, ABOUT_S = 0.03, 0.008
+BAND_ROWS = 20  # that are rendered at one time
+CONFIG = ReadoutConfig(pairs=56)
+FRONTEND = FrontendConfig(
+    tracking=TrackingConfig(strides=(2, 1, 1, 1)), mapping_enabled=False, readout=CONFIG
+)
+
+
+def walk(k: float) -> np.ndarray:
+    """To and fro, so that the velocity changes."""
+    return pose(
+        x=0.10 * np.sin(0.33 * k),
+        y=0.03 * np.sin(0.5 * k + 1),
+        z=-0.9 + 0.05 * np.sin(0.24 * k),
+        yaw=0.10 * np.sin(0.28 * k + 2),
+        pitch=0.05 * np.sin(0.41 * k),
+    )
+
+
+@cache
+def read(k: int, readout_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gray image and depth of a frame whose rows are read one after the other, a band of them at a time."""
+    if readout_s == 0:
+        return render(walk(k), camera=CAMERA)
+    first = np.arange(0, CAMERA.height, BAND_ROWS)
+    frames_later = row_times_ns(first + BAND_ROWS // 2, CAMERA.height, readout_s) / FRAME_NS
+    bands = [replace(CAMERA, height=BAND_ROWS, cy=CAMERA.cy - row) for row in first]
+    images = [render(walk(k + later), camera=band) for later, band in zip(frames_later, bands, strict=True)]
+    gray, depth = (np.concatenate(kind) for kind in zip(*images, strict=True))
+    return gray, depth
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Logs by what is read row after row."""
+    folder = tmp_path_factory.mktemp("readout")
+    kinds = {"none": (0.0, 0.0), "color": (READOUT_S, 0.0), "both": (READOUT_S, READOUT_S)}
+    kinds["upside down"] = (-READOUT_S, -READOUT_S)
+    return {name: write(folder / name, *readouts) for name, readouts in kinds.items()}
+
+
+def write(
+    folder: Path, color_s: float, depth_s: float, sensors: dict[str, str] | None = None, frames: int = FRAMES
+) -> Path:
+    rng = np.random.default_rng(0)
+    with (
+        RecordingWriter(folder) as recording,
+        recording.robot("alpha", CAMERA, 0.0005, sensors, find_regions=False) as robot,
+    ):
+        for k in range(frames):
+            gray, depth_m = read(k, color_s)[0], read(k, depth_s)[1]
+            gray = gray + 0.005 * rng.standard_normal(gray.shape)
+            image = np.repeat(np.rint(np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2)
+            raw = np.rint((depth_m + 0.003 * rng.standard_normal(depth_m.shape)) / 0.0005).astype(np.uint16)
+            robot.add_frame(k * FRAME_NS, cv2.imencode(".png", image)[1].tobytes(), "png", raw)
+    return folder / "alpha.mcap"
+
+
+def found(path: Path, config: ReadoutConfig = CONFIG) -> Readout:
+    """The readout of a log by the true path."""
+    stamps = np.array([k * FRAME_NS for k in range(FRAMES)])
+    with open_rgbd(path) as log:
+        readout = certain_readout(
+            log, [Trajectory(stamps, np.array([walk(k) for k in range(FRAMES)]))], config
+        )
+        assert not log.readout.rolls
+        return readout
+
+
+@pytest.mark.parametrize(
+    ("name", "color_s", "depth_s"),
+    [
+        ("both", READOUT_S, READOUT_S),
+        ("color", READOUT_S, 0.0),
+        ("upside down", -READOUT_S, -READOUT_S),
+        ("none", 0.0, 0.0),
+    ],
+)
+def test_a_readout_is_found_by_each_camera(
+    logs: dict[str, Path], name: str, color_s: float, depth_s: float
+) -> None:
+    readout = found(logs[name])
+    assert readout.color_s == pytest.approx(color_s, abs=ABOUT_S if color_s else 0)
+    assert readout.depth_s == pytest.approx(depth_s, abs=ABOUT_S if depth_s else 0)
+
+
+def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
+    logs: dict[str, Path], tmp_path: Path
+) -> None:
+    path = logs["both"]
+    assert not found(path, CONFIG.model_copy(update={"sigmas": 1000.0})).rolls
+    assert not found(path, CONFIG.model_copy(update={"min_pairs": 1000})).rolls
+    assert not found(path, CONFIG.model_copy(update={"enabled": False})).rolls
+    assert not found(path, CONFIG.model_copy(update={"least_move": 0.5})).rolls
+    stated = write(tmp_path / "stated", READOUT_S, 0.0, {COLOR_READOUT_KEY: "0"}, frames=3)
+    with open_rgbd(stated) as log:
+        assert log.states_readout
+        assert not certain_readout(log, [], CONFIG).rolls
+
+
+def test_the_front_end_makes_images_still_by_it(logs: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "frontend.mcap"
+    run_frontend(logs["color"], out, FRONTEND)
+    frames = [record.message() for record in read_log(out, (topics.ODOMETRY.of("alpha"),))]
+    T_first = se3.inverse(walk(0))
+    apart = [se3.distance(f.T_map_camera, T_first @ walk(f.frame_index))[0] for f in frames]
+    assert np.sqrt(np.mean(np.square(apart))) < 0.0075  # 0.015 without
+    with open_rgbd(logs["color"]) as log:
+        log.move_depth_by(out)
+        assert log.readout == Readout.found(out)
+        assert log.readout.color_s == pytest.approx(READOUT_S, abs=ABOUT_S)
+        assert log.readout.depth_s == 0
+        seen, rolling = log.frame(9).color[..., 0] / 255.0, read(9, READOUT_S)[0]
+        usable, still = log.frame(9).mask, render(walk(9), camera=CAMERA)[0]
+        assert np.abs(seen - still)[usable].mean() < 0.5 * np.abs(rolling - still)[usable].mean()
