@@ -5,7 +5,7 @@ camera, by depth for the depth camera. With a readout r the rows of a half were 
 image, a its mean place from -1/2 to 1/2, and their points r b after that of the second. Where the camera has the
 velocities v and w (right tangents per second), the two motions then differ by r (db w - da Ad v), db and da being
 the differences of b and a between the halves (`motion_differences`). Where the velocity does not change, a readout
-cannot be told from another lens, and harms as little.
+cannot be distinguished from another lens, and harms as little.
 
 In images that what was found has made still, what is left is looked for again, until it may be chance.
 """
