@@ -47,6 +47,7 @@ from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, re
 KINDS = (BY_COLOR, BY_DEPTH)
 STEP_PX = 8  # between the pixels by which the rows of a half are averaged
 CHANCE_SIGMAS = 2.0  # of what is left, below which it is chance
+SHORT_PERCENTILE = 10  # of the times between images
 MOVED_FRAMES = 20  # by which it is known how far rows move
 LEAST_POINTS = 50  # of a half that both frames see
 
@@ -79,11 +80,17 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
     """
     if not config.enabled or log.states_readout or has_sigma(log):
         return Readout()
-    longest_s = min(LONGEST_S, 1e-9 * log.shortest_interval_ns)
+    longest_s = min(LONGEST_S, _interval_s(log))
     if _moved(log, Readout(longest_s, longest_s), parts) < config.least_move:
         return Readout()
     readout = _found(log, list(view_pairs(log, parts, config.pairs)), config, longest_s)
     return readout if _moved(log, readout, parts) >= config.least_move else Readout()
+
+
+def _interval_s(log: RgbdLog) -> float:
+    """Seconds between images; where some are missing, between those that follow each other most closely."""
+    stamps = [color for color, _ in log.pairing.pairs]
+    return 1e-9 * float(np.percentile(np.diff(stamps), SHORT_PERCENTILE)) if len(stamps) > 1 else 0.0
 
 
 def _moved(log: RgbdLog, readout: Readout, parts: Sequence[Trajectory]) -> float:

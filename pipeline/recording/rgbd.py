@@ -26,8 +26,6 @@ from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, all_row
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.schemas import topics as topic_table
 
-SHORT_PERCENTILE = 10  # of the times between images
-
 
 @dataclass(frozen=True)
 class _Geometry:
@@ -210,12 +208,6 @@ class RgbdLog:
         return self._stated_readout is not None
 
     @property
-    def shortest_interval_ns(self) -> int:
-        """Time between images; where some are missing, between those that follow each other most closely."""
-        stamps = [color for color, _ in self.pairing.pairs]
-        return int(np.percentile(np.diff(stamps), SHORT_PERCENTILE)) if len(stamps) > 1 else 0
-
-    @property
     def needs_motion(self) -> bool:
         """Whether some depth, or some row, is of another time than its color."""
         return bool(self.pairing.largest_offset_ns) or self.readout.rolls
@@ -361,12 +353,11 @@ class RgbdLog:
         """The same of any image whose rows are of different times."""
         if self._motion is None or readout_s == 0:
             return None
-        height = self.camera.height
-        rows_ns = taken_ns + row_times_ns(known_rows(height), height, readout_s)
+        rows_ns = taken_ns + row_times_ns(known_rows(self.camera.height), self.camera.height, readout_s)
         T_color_then = self._motion.at(color_ns, np.append(rows_ns, taken_ns))
         if T_color_then is None:
             return None
-        T_middle_row = all_rows(se3.inverse(T_color_then[-1]) @ T_color_then[:-1], height)
+        T_middle_row = all_rows(se3.inverse(T_color_then[-1]) @ T_color_then[:-1], self.camera.height)
         return Unrolling(self.camera, T_middle_row, depth.depth_m)
 
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
