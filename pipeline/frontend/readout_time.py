@@ -1,7 +1,8 @@
 """How long the images of a log are read, row after row, where it does not state it: by motions that halves of them see.
 
 Two frames are registered by the upper half of the first one alone, and by the lower half alone; by color for the color
-camera, by depth for the depth camera. With a readout r the rows of a half were taken r a after the middle of the first
+camera, by depth for the depth camera. If that tells nothing, by the left and the right half: a camera that is turned
+reads column after column. With a readout r the rows of a half were taken r a after the middle of the first
 image, a its mean place from -1/2 to 1/2, and their points r b after that of the second. Where the camera has the
 velocities v and w (right tangents per second), the two motions then differ by r (db w - da Ad v), db and da being
 the differences of b and a between the halves (`motion_differences`). Where the velocity does not change, a readout
@@ -54,11 +55,11 @@ LEAST_POINTS = 50  # of a half that both frames see
 
 @dataclass(frozen=True)
 class _Half:
-    """The upper or lower half of an image, seen by another one.
+    """The upper, lower, left or right half of an image, seen by another one.
 
     Attributes:
         pyramid: of the image with the depth of this half alone.
-        place: mean row of its points in the image, as a share of its height, from -1/2 to 1/2.
+        place: mean row, or column, of its points in the image, as a share of all, from -1/2 to 1/2.
         place_seen: the same in the other image.
     """
 
@@ -81,10 +82,15 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
     if not config.enabled or log.states_readout or has_sigma(log):
         return Readout()
     longest_s = min(LONGEST_S, _interval_s(log))
-    if _moved(log, Readout(longest_s, longest_s), parts) < config.least_move:
+    longest = [Readout(longest_s, longest_s, by_columns) for by_columns in (False, True)]
+    if max(_moved(log, readout, parts) for readout in longest) < config.least_move:
         return Readout()
-    readout = _found(log, list(view_pairs(log, parts, config.pairs)), config, longest_s)
-    return readout if _moved(log, readout, parts) >= config.least_move else Readout()
+    pairs = list(view_pairs(log, parts, config.pairs))
+    for readout in longest:
+        found = _found(log, pairs, config, readout)
+        if found.rolls:
+            return found if _moved(log, found, parts) >= config.least_move else Readout()
+    return Readout()
 
 
 def _interval_s(log: RgbdLog) -> float:
@@ -104,21 +110,23 @@ def _moved(log: RgbdLog, readout: Readout, parts: Sequence[Trajectory]) -> float
 
 
 def _found(
-    log: RgbdLog, pairs: Sequence[tuple[MovingView, MovingView]], config: ReadoutConfig, longest_s: float
+    log: RgbdLog, pairs: Sequence[tuple[MovingView, MovingView]], config: ReadoutConfig, longest: Readout
 ) -> Readout:
     """What is certain of the readout."""
-    found = _estimated(log, pairs, config)
+    by_columns, longest_s = longest.by_columns, longest.color_s
+    found = _estimated(log, pairs, config, by_columns=by_columns)
     certain = [time is not None and time.is_certain(config) for time in found]
     times_s = [0.0, 0.0]
     for number in range(config.rounds if any(certain) else 0):
         if number:
-            log.readout = Readout(*times_s)
-            found = _estimated(log, pairs, config)
+            log.readout = Readout(times_s[0], times_s[1], by_columns)
+            found = _estimated(log, pairs, config, by_columns=by_columns)
         left_s = [_left_s(time) if known else 0.0 for known, time in zip(certain, found, strict=True)]
         times_s = [
             float(np.clip(sum(two), -longest_s, longest_s)) for two in zip(times_s, left_s, strict=True)
         ]
-    return Readout(*times_s)
+    log.readout = Readout()
+    return Readout(times_s[0], times_s[1], by_columns)
 
 
 def _left_s(time: FoundTime | None) -> float:
@@ -127,14 +135,18 @@ def _left_s(time: FoundTime | None) -> float:
 
 
 def _estimated(
-    log: RgbdLog, pairs: Sequence[tuple[MovingView, MovingView]], config: ReadoutConfig
+    log: RgbdLog,
+    pairs: Sequence[tuple[MovingView, MovingView]],
+    config: ReadoutConfig,
+    *,
+    by_columns: bool,
 ) -> list[FoundTime | None]:
     """What is left of the readout of color and of depth; None where too few pairs tell."""
     found: tuple[list[MotionDifference], ...] = [], []
     for first, second in pairs:
         seen, other = log.frame(first.index), log.frame(second.index)
         T_start = first.pose_of(second)
-        halves = [_half(log, seen, T_start, lower=lower) for lower in (False, True)]
+        halves = [_half(log, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
         target = RgbdPyramid(pyramid_of(other, log.camera, LEVELS).levels[1:])
         for kind, of_kind in zip(KINDS, found, strict=True):
             if (difference := _difference(first, second, halves, target, kind)) is not None:
@@ -142,23 +154,28 @@ def _estimated(
     return [estimated_time(of_kind, config) for of_kind in found]
 
 
-def _half(log: RgbdLog, frame: RgbdFrame, T_frame_other: Array, *, lower: bool) -> _Half | None:
-    """A half of a frame; None if the other frame sees hardly any of it."""
-    height, camera = log.camera.height, log.camera
+def _half(
+    log: RgbdLog, frame: RgbdFrame, T_frame_other: Array, half: int, *, by_columns: bool
+) -> _Half | None:
+    """The first or the second half of a frame; None if the other frame sees hardly any of it."""
+    camera = log.camera
+    lines = camera.width if by_columns else camera.height
+    rest = slice(None, lines // 2) if half else slice(lines // 2, None)
     depth_m = frame.depth.copy()
-    depth_m[slice(None, height // 2) if lower else slice(height // 2, None)] = 0
+    depth_m[(slice(None), rest) if by_columns else rest] = 0
     v, u = np.nonzero(depth_m[::STEP_PX, ::STEP_PX])
     v, u = STEP_PX * v, STEP_PX * u
     points = se3.transform(se3.inverse(T_frame_other), back_project(camera, u, v, depth_m[v, u]))
-    index, _, row = visible(camera, points)
+    index, column, row = visible(camera, points)
     if len(index) < LEAST_POINTS:
         return None
+    here, there = (u[index], column) if by_columns else (v[index], row)
     pyramid = pyramid_of(replace(frame, depth=depth_m), camera, LEVELS)
-    return _Half(RgbdPyramid(pyramid.levels[1:]), _place(v[index], height), _place(row, height))
+    return _Half(RgbdPyramid(pyramid.levels[1:]), _place(here, lines), _place(there, lines))
 
 
-def _place(rows: NDArray[np.int64], height: int) -> float:
-    return float(np.mean(rows)) / max(height - 1, 1) - 0.5
+def _place(at: NDArray[np.int64], lines: int) -> float:
+    return float(np.mean(at)) / max(lines - 1, 1) - 0.5
 
 
 def _difference(
@@ -179,13 +196,13 @@ def _difference(
         if registered.outcome not in MEASURED:
             return None
         found.append((half, registered))
-    (upper, by_upper), (lower, by_lower) = found
-    T = by_upper.T_reference_target
+    (one, by_one), (two, by_two) = found
+    T = by_one.T_reference_target
     Ad = se3.adjoint(se3.inverse(T))
-    here, there = lower.place - upper.place, lower.place_seen - upper.place_seen
+    here, there = two.place - one.place, two.place_seen - one.place_seen
     return MotionDifference(
-        se3.log(se3.inverse(T) @ by_lower.T_reference_target),
+        se3.log(se3.inverse(T) @ by_two.T_reference_target),
         there * second.velocity - here * (Ad @ first.velocity),
         np.eye(6) - Ad,
-        joint_information(by_upper.information, by_lower.information),
+        joint_information(by_one.information, by_two.information),
     )

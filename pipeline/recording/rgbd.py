@@ -22,7 +22,7 @@ from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, mo
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile, Record
 from duagc.pipeline.recording.rgbd_frame import RgbdFrame
-from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, all_rows, known_rows, row_times_ns
+from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, all_lines, known_lines, line_times_ns
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.schemas import topics as topic_table
 
@@ -55,9 +55,8 @@ class RgbdLog:
     to all of them.
 
     `robot`, `camera`, `depth_scale` (meters per unit), `valid` (bool [H, W], pixels that show the scene; None = all),
-    `depth_delay_ns` (of `delay_depth`), `readout` (how long images are read, as the log states it, or as it was found),
-    `stated_shutter_s` (how long the shutter is open, seconds, if it states that), `shutter` (of `open_shutter`).
-    Reads what is asked for and keeps no more than a few frames.
+    `depth_delay_ns` (of `delay_depth`), `readout` (how long images are read, as stated or found), `stated_shutter_s`
+    (how long the shutter is open, seconds, if it states that), `shutter` (of `open_shutter`). Keeps few frames.
     """
 
     def __init__(self, path: Path) -> None:
@@ -353,12 +352,13 @@ class RgbdLog:
         """The same of any image whose rows are of different times."""
         if self._motion is None or readout_s == 0:
             return None
-        rows_ns = taken_ns + row_times_ns(known_rows(self.camera.height), self.camera.height, readout_s)
-        T_color_then = self._motion.at(color_ns, np.append(rows_ns, taken_ns))
+        count = self.readout.lines(self.camera)
+        lines_ns = taken_ns + line_times_ns(known_lines(count), count, readout_s)
+        T_color_then = self._motion.at(color_ns, np.append(lines_ns, taken_ns))
         if T_color_then is None:
             return None
-        T_middle_row = all_rows(se3.inverse(T_color_then[-1]) @ T_color_then[:-1], self.camera.height)
-        return Unrolling(self.camera, T_middle_row, depth.depth_m)
+        T_middle_line = all_lines(se3.inverse(T_color_then[-1]) @ T_color_then[:-1], count)
+        return Unrolling(self.camera, T_middle_line, depth.depth_m, by_columns=self.readout.by_columns)
 
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [H, W] with 0 where the camera never shows the scene."""

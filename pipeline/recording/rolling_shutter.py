@@ -28,10 +28,12 @@ Image = NDArray[np.float32]
 COLOR_READOUT_KEY, DEPTH_READOUT_KEY = "rolling_shutter_s", "depth_rolling_shutter_s"
 """In the metadata of a log: seconds from the first to the last row of an image, the stamp in the middle of them; in
 that of a front end's log, as it found them, negative where the last row was read first."""
+LINES_KEY, COLUMNS = "rolling_shutter_lines", "columns"
+"""In the metadata of a front end's log: columns are read one after the other, by a camera that is turned."""
 LONGEST_S = 0.2
 LEAST_MOVE_PX = 0.25  # of a pixel between the middle row and its own: less is not worth to interpolate for
 STEP_PX = 16  # between the pixels whose motion is computed; that of the others is interpolated
-ROWS_APART = 8  # between the rows whose poses are computed; those of the others are interpolated
+LINES_APART = 8  # between the rows whose poses are computed; those of the others are interpolated
 SAMPLE_PX = 4  # between the depths that a mean over a neighborhood is taken of
 ROUNDS = 3  # of looking up the row of a pixel; each brings it nearer by as much as the motion changes by row
 
@@ -43,10 +45,12 @@ class Readout:
     Attributes:
         color_s: of color.
         depth_s: of depth.
+        by_columns: whether columns are read one after the other, and not rows.
     """
 
     color_s: float = 0.0
     depth_s: float = 0.0
+    by_columns: bool = False
 
     @staticmethod
     def stated(metadata: Mapping[str, str], where: str) -> Readout | None:
@@ -61,9 +65,9 @@ class Readout:
         """
         if COLOR_READOUT_KEY not in metadata and DEPTH_READOUT_KEY not in metadata:
             return None
-        return Readout(
-            *(_seconds(metadata, key, where, 0.0) for key in (COLOR_READOUT_KEY, DEPTH_READOUT_KEY))
-        )
+        keys = COLOR_READOUT_KEY, DEPTH_READOUT_KEY
+        color_s, depth_s = (_seconds(metadata, key, where, 0.0) for key in keys)
+        return Readout(color_s, depth_s)
 
     @staticmethod
     def found(frontend: Path) -> Readout | None:
@@ -79,11 +83,21 @@ class Readout:
         if COLOR_READOUT_KEY not in metadata:
             return None
         keys = COLOR_READOUT_KEY, DEPTH_READOUT_KEY
-        return Readout(*(_seconds(metadata, key, str(frontend), -LONGEST_S) for key in keys))
+        color_s, depth_s = (_seconds(metadata, key, str(frontend), -LONGEST_S) for key in keys)
+        return Readout(color_s, depth_s, metadata.get(LINES_KEY) == COLUMNS)
 
     def notes(self) -> dict[str, str]:
         """For the metadata of a front end's log."""
-        return {COLOR_READOUT_KEY: repr(self.color_s), DEPTH_READOUT_KEY: repr(self.depth_s)}
+        notes = {COLOR_READOUT_KEY: repr(self.color_s), DEPTH_READOUT_KEY: repr(self.depth_s)}
+        return notes | ({LINES_KEY: COLUMNS} if self.by_columns else {})
+
+    def lines(self, camera: PinholeCamera) -> int:
+        """How many rows, or columns, an image has.
+
+        Args:
+            camera: of the images.
+        """
+        return camera.width if self.by_columns else camera.height
 
     @property
     def rolls(self) -> bool:
@@ -102,61 +116,67 @@ def _seconds(metadata: Mapping[str, str], key: str, where: str, least_s: float) 
     return seconds
 
 
-def known_rows(height: int) -> NDArray[np.int64]:
-    """Rows of an image whose poses are computed.
+def known_lines(count: int) -> NDArray[np.int64]:
+    """Rows, or columns, of an image whose poses are computed.
 
     Args:
-        height: of the image.
+        count: that it has.
     """
-    return np.unique(np.r_[np.arange(0, height, ROWS_APART), height - 1])
+    return np.unique(np.r_[np.arange(0, count, LINES_APART), count - 1])
 
 
-def row_times_ns(rows: NDArray[np.int64], height: int, readout_s: float) -> NDArray[np.int64]:
-    """Times of rows of an image from that of its middle.
+def line_times_ns(lines: NDArray[np.int64], count: int, readout_s: float) -> NDArray[np.int64]:
+    """Times of rows, or columns, of an image from that of its middle.
 
     Args:
-        rows: which.
-        height: of the image.
-        readout_s: from the first to the last row.
+        lines: which.
+        count: that it has.
+        readout_s: from the first to the last.
     """
-    return np.rint(1e9 * readout_s * (rows / max(height - 1, 1) - 0.5)).astype(np.int64)
+    return np.rint(1e9 * readout_s * (lines / max(count - 1, 1) - 0.5)).astype(np.int64)
 
 
-def all_rows(T_middle_row: Array, height: int) -> Array:
-    """Poses [h, 4, 4] of all rows, by those of `known_rows`: elements in between are interpolated.
+def all_lines(T_middle_line: Array, count: int) -> Array:
+    """Poses [count, 4, 4] of all rows, or columns; elements between those that are known are interpolated.
 
     Args:
-        T_middle_row: [k, 4, 4].
-        height: of the image.
+        T_middle_line: [k, 4, 4], of `known_lines`.
+        count: of the image.
     """
-    known, rows = known_rows(height), np.arange(height)
-    after = np.clip(np.searchsorted(known, rows), 1, max(len(known) - 1, 1))
-    before = after - 1 if len(known) > 1 else after * 0
-    after = np.minimum(after, len(known) - 1)
-    share = (rows - known[before]) / np.maximum(known[after] - known[before], 1)
-    share = share[:, None, None]
-    return np.asarray((1 - share) * T_middle_row[before] + share * T_middle_row[after])
+    known = len(T_middle_line)
+    at = np.interp(np.arange(count), known_lines(count), np.arange(known))
+    before = np.minimum(at.astype(np.int64), max(known - 2, 0))
+    share = (at - before)[:, None, None]
+    return np.asarray(
+        (1 - share) * T_middle_line[before] + share * T_middle_line[np.minimum(before + 1, known - 1)]
+    )
 
 
 class Unrolling:
     """Where in a rolling image each pixel of a still one is."""
 
-    def __init__(self, camera: PinholeCamera, T_middle_row: Array, depth_m: Image) -> None:
+    def __init__(
+        self, camera: PinholeCamera, T_middle_line: Array, depth_m: Image, *, by_columns: bool = False
+    ) -> None:
         """Set up.
 
         Args:
             camera: of the images.
-            T_middle_row: [h, 4, 4], from the camera when a row was taken to the camera in the middle of the readout.
+            T_middle_line: [h, 4, 4], from the camera when a row was taken to the camera in the middle of the readout;
+                by columns [w, 4, 4].
             depth_m: depth [h, w] of about that time, 0 = unknown: parallax is that of its means over a neighborhood.
+            by_columns: whether columns were read one after the other.
         """
-        self._camera, self._T_row_middle = camera, se3.inverse(T_middle_row)
+        self._camera, self._by_columns = camera, by_columns
+        self._T_line_middle = se3.inverse(T_middle_line)
         rows, columns = _steps(camera.height), _steps(camera.width)
         u, v = np.meshgrid(columns, rows)
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         points = rays / _mean_inverse(depth_m, rows, columns)[..., None]
         found_u, found_v = u, v
         for _ in range(ROUNDS):
-            T = self._T_row_middle[np.clip(np.rint(found_v), 0, camera.height - 1).astype(np.int64)]
+            line = np.rint(found_u if by_columns else found_v).astype(np.int64)
+            T = self._T_line_middle[np.clip(line, 0, len(self._T_line_middle) - 1)]
             there = np.einsum("...ij,...j->...i", T[..., :3, :3], points) + T[..., :3, 3]
             found_u = camera.fx * there[..., 0] / there[..., 2] + camera.cx
             found_v = camera.fy * there[..., 1] / there[..., 2] + camera.cy
@@ -213,9 +233,10 @@ class Unrolling:
         x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)[None]
         y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)[:, None]
         # z when the row was read, of a point now
-        third = self._T_row_middle[:, 2].astype(np.float32)[..., None]
+        third = self._T_line_middle[:, 2].astype(np.float32)
+        third = third[None] if self._by_columns else third[:, None]
         read_m = nearest(depth.depth_m)
-        z = (read_m - third[:, 3]) / (third[:, 0] * x + third[:, 1] * y + third[:, 2])
+        z = (read_m - third[..., 3]) / (third[..., 0] * x + third[..., 1] * y + third[..., 2])
         found = np.where((read_m > 0) & (z > 0), z, np.float32(0)).astype(np.float32)
         sigma = None if depth.sigma_m is None else np.where(found > 0, nearest(depth.sigma_m), np.float32(0))
         return DepthImage(found, sigma)

@@ -16,14 +16,14 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import open_rgbd, read_log
-from duagc.pipeline.recording.rolling_shutter import COLOR_READOUT_KEY, Readout, row_times_ns
+from duagc.pipeline.recording.rolling_shutter import COLOR_READOUT_KEY, Readout, line_times_ns
 from duagc.schemas import topics
 from tests.fixtures.room import pose, render
 
 CAMERA = PinholeCamera(240, 180, 195.0, 195.0, 119.5, 89.5)
 FRAMES, FRAME_NS = 56, 33_333_333
 READOUT_S, ABOUT_S = 0.03, 0.008
-BAND_ROWS = 20  # that are rendered at one time
+BAND = 20  # rows, or columns, that are rendered at one time
 CONFIG = ReadoutConfig(pairs=56)
 FRONTEND = FrontendConfig(
     tracking=TrackingConfig(strides=(2, 1, 1, 1)), mapping_enabled=False, readout=CONFIG
@@ -42,15 +42,21 @@ def walk(k: float) -> np.ndarray:
 
 
 @cache
-def read(k: int, readout_s: float) -> tuple[np.ndarray, np.ndarray]:
+def read(k: int, readout_s: float, by_columns: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Gray image and depth of a frame whose rows are read one after the other, a band of them at a time."""
     if readout_s == 0:
         return render(walk(k), camera=CAMERA)
-    first = np.arange(0, CAMERA.height, BAND_ROWS)
-    frames_later = row_times_ns(first + BAND_ROWS // 2, CAMERA.height, readout_s) / FRAME_NS
-    bands = [replace(CAMERA, height=BAND_ROWS, cy=CAMERA.cy - row) for row in first]
+    count = CAMERA.width if by_columns else CAMERA.height
+    first = np.arange(0, count, BAND)
+    frames_later = line_times_ns(first + BAND // 2, count, readout_s) / FRAME_NS
+    bands = [
+        replace(CAMERA, width=BAND, cx=CAMERA.cx - at)
+        if by_columns
+        else replace(CAMERA, height=BAND, cy=CAMERA.cy - at)
+        for at in first
+    ]
     images = [render(walk(k + later), camera=band) for later, band in zip(frames_later, bands, strict=True)]
-    gray, depth = (np.concatenate(kind) for kind in zip(*images, strict=True))
+    gray, depth = (np.concatenate(kind, axis=int(by_columns)) for kind in zip(*images, strict=True))
     return gray, depth
 
 
@@ -58,13 +64,18 @@ def read(k: int, readout_s: float) -> tuple[np.ndarray, np.ndarray]:
 def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Logs by what is read row after row."""
     folder = tmp_path_factory.mktemp("readout")
-    kinds = {"none": (0.0, 0.0), "color": (READOUT_S, 0.0), "both": (READOUT_S, READOUT_S)}
-    kinds["upside down"] = (-READOUT_S, -READOUT_S)
-    return {name: write(folder / name, *readouts) for name, readouts in kinds.items()}
+    kinds = {
+        "none": Readout(),
+        "color": Readout(READOUT_S),
+        "both": Readout(READOUT_S, READOUT_S),
+        "upside down": Readout(-READOUT_S, -READOUT_S),
+        "turned": Readout(READOUT_S, by_columns=True),
+    }
+    return {name: write(folder / name, readout) for name, readout in kinds.items()}
 
 
 def write(
-    folder: Path, color_s: float, depth_s: float, sensors: dict[str, str] | None = None, frames: int = FRAMES
+    folder: Path, readout: Readout, sensors: dict[str, str] | None = None, frames: int = FRAMES
 ) -> Path:
     rng = np.random.default_rng(0)
     with (
@@ -72,7 +83,8 @@ def write(
         recording.robot("alpha", CAMERA, 0.0005, sensors, find_regions=False) as robot,
     ):
         for k in range(frames):
-            gray, depth_m = read(k, color_s)[0], read(k, depth_s)[1]
+            gray = read(k, readout.color_s, readout.by_columns)[0]
+            depth_m = read(k, readout.depth_s, readout.by_columns)[1]
             gray = gray + 0.005 * rng.standard_normal(gray.shape)
             image = np.repeat(np.rint(np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2)
             raw = np.rint((depth_m + 0.003 * rng.standard_normal(depth_m.shape)) / 0.0005).astype(np.uint16)
@@ -97,6 +109,7 @@ def found(path: Path, config: ReadoutConfig = CONFIG) -> Readout:
         ("both", READOUT_S, READOUT_S),
         ("color", READOUT_S, 0.0),
         ("upside down", -READOUT_S, -READOUT_S),
+        ("turned", READOUT_S, 0.0),
         ("none", 0.0, 0.0),
     ],
 )
@@ -104,6 +117,7 @@ def test_a_readout_is_found_by_each_camera(
     logs: dict[str, Path], name: str, color_s: float, depth_s: float
 ) -> None:
     readout = found(logs[name])
+    assert readout.by_columns == (name == "turned")
     assert readout.color_s == pytest.approx(color_s, abs=ABOUT_S if color_s else 0)
     assert readout.depth_s == pytest.approx(depth_s, abs=ABOUT_S if depth_s else 0)
 
@@ -116,7 +130,7 @@ def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
     assert not found(path, CONFIG.model_copy(update={"min_pairs": 1000})).rolls
     assert not found(path, CONFIG.model_copy(update={"enabled": False})).rolls
     assert not found(path, CONFIG.model_copy(update={"least_move": 0.5})).rolls
-    stated = write(tmp_path / "stated", READOUT_S, 0.0, {COLOR_READOUT_KEY: "0"}, frames=3)
+    stated = write(tmp_path / "stated", Readout(READOUT_S), {COLOR_READOUT_KEY: "0"}, frames=3)
     with open_rgbd(stated) as log:
         assert log.states_readout
         assert not certain_readout(log, [], CONFIG).rolls

@@ -13,7 +13,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.recording.depth_sources import DepthImage
-from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, row_times_ns
+from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, all_lines, known_lines, line_times_ns
 
 CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 79.5, 59.5)
 TWIST = np.array([0.4, -0.2, 0.3, 0.5, 1.2, -0.4])  # m/s and rad/s, of a hasty hand
@@ -21,10 +21,11 @@ READOUT_S = 0.03
 SCALE_M = 0.0002
 
 
-def shot(T_world_row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Color and depth of a slanted wall; T_world_row: [h, 4, 4], where the camera was at each row."""
-    rays = np.einsum("vij,vuj->vui", T_world_row[:, :3, :3], CAMERA.rays())
-    normal, origin = np.array([0.3, 0.1, -1.0]), T_world_row[:, None, :3, 3]
+def shot(T_world_line: np.ndarray, by_columns: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Color and depth of a slanted wall; T_world_line: where the camera was at each row [h, 4, 4], or column."""
+    rays = np.einsum("uij,vuj->vui" if by_columns else "vij,vuj->vui", T_world_line[:, :3, :3], CAMERA.rays())
+    normal, origin = np.array([0.3, 0.1, -1.0]), T_world_line[:, :3, 3]
+    origin = origin[None] if by_columns else origin[:, None]
     z = (-2.0 - origin @ normal) / (rays @ normal)
     at = origin + rays * z[..., None]
     waves = at @ np.array([[6.0, 1.0, 4.0], [1.0, 7.0, -4.0], [0.0, 0.0, 0.0]])
@@ -36,7 +37,7 @@ def poses(times_s: np.ndarray) -> np.ndarray:
 
 
 def rows(middle_s: float) -> np.ndarray:
-    return poses(middle_s + 1e-9 * row_times_ns(np.arange(CAMERA.height), CAMERA.height, READOUT_S))
+    return poses(middle_s + 1e-9 * line_times_ns(np.arange(CAMERA.height), CAMERA.height, READOUT_S))
 
 
 def still(middle_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -53,9 +54,12 @@ def differences(
     return float(np.percentile(off, 90)), float(np.percentile(np.abs(depth - true_depth)[both], 90))
 
 
-def test_an_image_is_as_a_still_camera_takes_it() -> None:
-    color, depth = shot(rows(0.0))
-    unrolling = Unrolling(CAMERA, rows(0.0), depth)
+@pytest.mark.parametrize("by_columns", [False, True])
+def test_an_image_is_as_a_still_camera_takes_it(by_columns: bool) -> None:
+    count = Readout(by_columns=by_columns).lines(CAMERA)
+    lines = poses(1e-9 * line_times_ns(np.arange(count), count, READOUT_S))
+    color, depth = shot(lines, by_columns)
+    unrolling = Unrolling(CAMERA, lines, depth, by_columns=by_columns)
     assert unrolling.is_needed
     usable = unrolling.usable(None)
     assert 0.9 < usable.mean() < 1
@@ -96,6 +100,13 @@ def test_each_camera_states_its_own_readout() -> None:
     assert Readout.stated({"rolling_shutter_s": "0.02"}, "") == Readout(0.02, 0.0)
     assert Readout.stated({"depth_rolling_shutter_s": "0.03"}, "") == Readout(0.0, 0.03)
     assert Readout.stated({}, "") is None
+
+
+def test_poses_between_those_that_are_computed_are_interpolated() -> None:
+    for count in (1, 2, 119, 480):
+        known = poses(1e-9 * line_times_ns(known_lines(count), count, READOUT_S))
+        every = poses(1e-9 * line_times_ns(np.arange(count), count, READOUT_S))
+        assert np.allclose(all_lines(known, count), every, atol=1e-5)
 
 
 @pytest.mark.parametrize("stated", [True, False])
