@@ -149,7 +149,7 @@ def _estimated(
         halves = [_half(log, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
         target = RgbdPyramid(pyramid_of(other, log.camera, LEVELS).levels[1:])
         for kind, of_kind in zip(KINDS, found, strict=True):
-            if (difference := _difference(first, second, halves, target, kind)) is not None:
+            if (difference := _difference(first, second, halves, target, kind=kind)) is not None:
                 of_kind.append(difference)
     return [estimated_time(of_kind, config) for of_kind in found]
 
@@ -183,6 +183,7 @@ def _difference(
     second: MovingView,
     halves: Sequence[_Half | None],
     target: RgbdPyramid,
+    *,
     kind: RegistrationConfig,
 ) -> MotionDifference | None:
     """The difference of a pair; None if the motion of either half cannot be found."""
