@@ -1,7 +1,7 @@
 """How long the images of a log are read, row after row, where it does not state it: by motions that halves of them see.
 
 Two frames are registered by the upper half of the first one alone, and by the lower half alone; by color for the color
-camera, by depth for the depth camera. If that tells nothing, by the left and the right half: a camera that is turned
+camera, by depth for the depth camera. If that shows nothing, by the left and the right half: a camera that is turned
 reads column after column. With a readout r the rows of a half were taken r a after the middle of the first
 image, a its mean place from -1/2 to 1/2, and their points r b after that of the second. Where the camera has the
 velocities v and w (right tangents per second), the two motions then differ by r (db w - da Ad v), db and da being
