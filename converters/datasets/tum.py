@@ -17,11 +17,12 @@ from pydantic import Field
 from duagc.converters.layouts import image_folder, tum_layout
 from duagc.converters.layouts.image_files import image_size, options_of
 from duagc.converters.layouts.image_folder import Clip
-from duagc.converters.layouts.kinect import kinect_readout, no_readout
+from duagc.converters.layouts.kinect import KINECT_READOUT
 from duagc.converters.robot_writer import check_camera
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.rolling_shutter import Readout
 
 DEPTH_SCALE = 1 / 5000
 KINECT = "Kinect v1"
@@ -69,9 +70,9 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         warnings.append(
             f"depth is taken as {DEPTH_SCALE} m per unit, as of a Kinect; expected --set depth_scale=METERS"
         )
-    readout = kinect_readout() if sensor == KINECT else {}
+    readout = KINECT_READOUT.notes() if sensor == KINECT else {}
     if settings.rolling_shutter == "none":
-        readout = no_readout()
+        readout = Readout().notes()
     clip = Clip(
         "",
         frames,

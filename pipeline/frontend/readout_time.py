@@ -13,13 +13,15 @@ In images that what was found has made still, what is left is looked for again, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.frontend import ReadoutConfig
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.frontend.frame_images import pyramid_of
@@ -46,6 +48,7 @@ from duagc.pipeline.recording.rolling_shutter import LONGEST_S, Readout
 from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
 
 KINDS = (BY_COLOR, BY_DEPTH)
+ORIENTATIONS = (False, True)  # whether by columns
 STEP_PX = 8  # between the pixels by which the rows of a half are averaged
 CHANCE_SIGMAS = 2.0  # of what is left, below which it is chance
 SHORT_PERCENTILE = 10  # of the times between images
@@ -82,15 +85,34 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
     if not config.enabled or log.states_readout or has_sigma(log):
         return Readout()
     longest_s = min(LONGEST_S, _interval_s(log))
-    longest = [Readout(longest_s, longest_s, by_columns) for by_columns in (False, True)]
+    longest = [Readout(longest_s, longest_s, by_columns) for by_columns in ORIENTATIONS]
     if max(_moved(log, readout, parts) for readout in longest) < config.least_move:
         return Readout()
     pairs = list(view_pairs(log, parts, config.pairs))
+    with _made_still(log, Readout(), parts):
+        first = _estimated(log, pairs, config, ORIENTATIONS)
     for readout in longest:
-        found = _found(log, pairs, config, readout)
-        if found.rolls:
+        certain = [time is not None and time.is_certain(config) for time in first[readout.by_columns]]
+        if any(certain):
+            found = Readout(by_columns=readout.by_columns)
+            found = _added(found, first[readout.by_columns], certain, longest_s)
+            for _ in range(config.rounds - 1):
+                with _made_still(log, found, parts):
+                    left = _estimated(log, pairs, config, (readout.by_columns,))[readout.by_columns]
+                found = _added(found, left, certain, longest_s)
             return found if _moved(log, found, parts) >= config.least_move else Readout()
     return Readout()
+
+
+@contextmanager
+def _made_still(log: RgbdLog, readout: Readout, parts: Sequence[Trajectory]) -> Iterator[None]:
+    """Lets frames be read as if their images were read in such a time."""
+    log.readout = readout
+    log.move_depth(*parts)
+    try:
+        yield
+    finally:
+        log.readout = Readout()
 
 
 def _interval_s(log: RgbdLog) -> float:
@@ -101,57 +123,44 @@ def _interval_s(log: RgbdLog) -> float:
 
 def _moved(log: RgbdLog, readout: Readout, parts: Sequence[Trajectory]) -> float:
     """How far the rows of the median frame move in such a time, in its median pixel, as a share of its width."""
-    log.readout = readout
-    log.move_depth(*parts)
-    some = evenly_spaced(len(log), min(MOVED_FRAMES, len(log)))
-    moved_px = float(np.median([log.moved_rows_px(index) for index in some]))
-    log.readout = Readout()
-    return moved_px / log.camera.width
+    used = [index for index in range(len(log)) if not is_held_out(index)]
+    some = [used[k] for k in evenly_spaced(len(used), min(MOVED_FRAMES, len(used)))]
+    with _made_still(log, readout, parts):
+        return float(np.median([log.moved_rows_px(index) for index in some])) / log.camera.width
 
 
-def _found(
-    log: RgbdLog, pairs: Sequence[tuple[MovingView, MovingView]], config: ReadoutConfig, longest: Readout
+def _added(
+    readout: Readout, left: Sequence[FoundTime | None], certain: Sequence[bool], longest_s: float
 ) -> Readout:
-    """What is certain of the readout."""
-    by_columns, longest_s = longest.by_columns, longest.color_s
-    found = _estimated(log, pairs, config, by_columns=by_columns)
-    certain = [time is not None and time.is_certain(config) for time in found]
-    times_s = [0.0, 0.0]
-    for number in range(config.rounds if any(certain) else 0):
-        if number:
-            log.readout = Readout(times_s[0], times_s[1], by_columns)
-            found = _estimated(log, pairs, config, by_columns=by_columns)
-        left_s = [_left_s(time) if known else 0.0 for known, time in zip(certain, found, strict=True)]
-        times_s = [
-            float(np.clip(sum(two), -longest_s, longest_s)) for two in zip(times_s, left_s, strict=True)
-        ]
-    log.readout = Readout()
-    return Readout(times_s[0], times_s[1], by_columns)
-
-
-def _left_s(time: FoundTime | None) -> float:
-    """What is left of a readout; 0 if it may be chance."""
-    return time.time_s if time is not None and abs(time.time_s) > CHANCE_SIGMAS * time.sigma_s else 0.0
+    """A readout with what is left of it, by kind, where that is certain to roll and what is left is no chance."""
+    times_s = [readout.color_s, readout.depth_s]
+    for kind, time in enumerate(left):
+        if certain[kind] and time is not None and abs(time.time_s) > CHANCE_SIGMAS * time.sigma_s:
+            times_s[kind] = float(np.clip(times_s[kind] + time.time_s, -longest_s, longest_s))
+    return Readout(times_s[0], times_s[1], readout.by_columns)
 
 
 def _estimated(
     log: RgbdLog,
     pairs: Sequence[tuple[MovingView, MovingView]],
     config: ReadoutConfig,
-    *,
-    by_columns: bool,
-) -> list[FoundTime | None]:
-    """What is left of the readout of color and of depth; None where too few pairs tell."""
-    found: tuple[list[MotionDifference], ...] = [], []
+    orientations: Sequence[bool],
+) -> dict[bool, list[FoundTime | None]]:
+    """What is left of the readout of color and of depth, by rows and by columns; None where too few pairs tell."""
+    found: dict[bool, list[list[MotionDifference]]] = {of: [[], []] for of in orientations}
     for first, second in pairs:
         seen, other = log.frame(first.index), log.frame(second.index)
         T_start = first.pose_of(second)
-        halves = [_half(log, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
         target = RgbdPyramid(pyramid_of(other, log.camera, LEVELS).levels[1:])
-        for kind, of_kind in zip(KINDS, found, strict=True):
-            if (difference := _difference(first, second, halves, target, kind=kind)) is not None:
-                of_kind.append(difference)
-    return [estimated_time(of_kind, config) for of_kind in found]
+        for by_columns, of_kinds in found.items():
+            halves = [_half(log, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
+            for kind, of_kind in zip(KINDS, of_kinds, strict=True):
+                if (difference := _difference(first, second, halves, target, kind=kind)) is not None:
+                    of_kind.append(difference)
+    return {
+        by_columns: [estimated_time(of_kind, config) for of_kind in of_kinds]
+        for by_columns, of_kinds in found.items()
+    }
 
 
 def _half(
@@ -159,7 +168,7 @@ def _half(
 ) -> _Half | None:
     """The first or the second half of a frame; None if the other frame sees hardly any of it."""
     camera = log.camera
-    lines = camera.width if by_columns else camera.height
+    lines = Readout(by_columns=by_columns).lines(camera)
     rest = slice(None, lines // 2) if half else slice(lines // 2, None)
     depth_m = frame.depth.copy()
     depth_m[(slice(None), rest) if by_columns else rest] = 0

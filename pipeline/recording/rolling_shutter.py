@@ -63,11 +63,7 @@ class Readout:
         Raises:
             DuagError: a time that no camera takes.
         """
-        if COLOR_READOUT_KEY not in metadata and DEPTH_READOUT_KEY not in metadata:
-            return None
-        keys = COLOR_READOUT_KEY, DEPTH_READOUT_KEY
-        color_s, depth_s = (_seconds(metadata, key, where, 0.0) for key in keys)
-        return Readout(color_s, depth_s)
+        return _parsed(metadata, where, 0.0)
 
     @staticmethod
     def found(frontend: Path) -> Readout | None:
@@ -79,15 +75,10 @@ class Readout:
         Raises:
             DuagError: a time that no camera takes.
         """
-        metadata = log_metadata(frontend)
-        if COLOR_READOUT_KEY not in metadata:
-            return None
-        keys = COLOR_READOUT_KEY, DEPTH_READOUT_KEY
-        color_s, depth_s = (_seconds(metadata, key, str(frontend), -LONGEST_S) for key in keys)
-        return Readout(color_s, depth_s, metadata.get(LINES_KEY) == COLUMNS)
+        return _parsed(log_metadata(frontend), str(frontend), -LONGEST_S)
 
     def notes(self) -> dict[str, str]:
-        """For the metadata of a front end's log."""
+        """What the metadata of a log say of it."""
         notes = {COLOR_READOUT_KEY: repr(self.color_s), DEPTH_READOUT_KEY: repr(self.depth_s)}
         return notes | ({LINES_KEY: COLUMNS} if self.by_columns else {})
 
@@ -103,6 +94,15 @@ class Readout:
     def rolls(self) -> bool:
         """Whether rows are read one after the other."""
         return self.color_s != 0 or self.depth_s != 0
+
+
+def _parsed(metadata: Mapping[str, str], where: str, least_s: float) -> Readout | None:
+    """The readout that metadata of a log say; None if they say nothing."""
+    keys = COLOR_READOUT_KEY, DEPTH_READOUT_KEY
+    if metadata.keys().isdisjoint(keys):
+        return None
+    color_s, depth_s = (_seconds(metadata, key, where, least_s) for key in keys)
+    return Readout(color_s, depth_s, metadata.get(LINES_KEY) == COLUMNS)
 
 
 def _seconds(metadata: Mapping[str, str], key: str, where: str, least_s: float) -> float:

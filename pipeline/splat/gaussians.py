@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.base.arrays import rows_of
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry import se3, so3
 
@@ -71,9 +72,7 @@ class Gaussians:
         """
         if isinstance(index, slice):
             return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
-        rows = np.asarray(index)
-        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
-        # three times as fast as arrays[index]
+        rows = rows_of(index)
         return Gaussians(**{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)})
 
     def copy(self) -> Gaussians:

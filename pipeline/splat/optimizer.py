@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import rows_of
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -113,8 +114,7 @@ class Adam:
 
     def select(self, index: NDArray) -> None:
         """Keep the state of the Gaussians of a mask or an index array, in that order."""
-        rows = np.flatnonzero(index) if index.dtype == np.bool_ else index
-        # three times as fast as arrays[index]
+        rows = rows_of(index)
         self._first = {name: moments.take(rows, axis=0) for name, moments in self._first.items()}
         self._second = {name: moments.take(rows, axis=0) for name, moments in self._second.items()}
         self._steps = self._steps.take(rows)

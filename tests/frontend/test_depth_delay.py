@@ -3,66 +3,40 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import DelayConfig, FrontendConfig, TrackingConfig
 from duagc.pipeline.frontend.depth_delay import certain_delay_ns
 from duagc.pipeline.frontend.motion_differences import MotionDifference, estimated_time
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.trajectory import Trajectory
-from duagc.pipeline.recording import open_rgbd, read_log
+from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.recording.moved_depth import depth_delay_ns
-from duagc.schemas import topics
-from tests.fixtures.room import CAMERA, pose, render
+from tests.fixtures.carried_camera import FRAME_NS, rms_error_m, true_path, walk, write
+from tests.fixtures.room import CAMERA, render
 
-FRAMES, FRAME_NS = 40, 33_333_333
+FRAMES = 40
 LATE_NS = 20_000_000
 CONFIG = DelayConfig()
 FRONTEND = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)), mapping_enabled=False)
 
 
-def walk(k: float) -> np.ndarray:
-    """To and fro, so that the velocity changes."""
-    return pose(
-        x=0.10 * np.sin(0.33 * k),
-        y=0.03 * np.sin(0.5 * k + 1),
-        z=-0.9 + 0.05 * np.sin(0.24 * k),
-        yaw=0.10 * np.sin(0.28 * k + 2),
-        pitch=0.05 * np.sin(0.41 * k),
-    )
-
-
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     """Logs by how much earlier than its stamps say depth was taken, ns."""
-    rng, images = np.random.default_rng(0), [render(walk(k)) for k in range(FRAMES)]
-    late = [render(walk(k - LATE_NS / FRAME_NS))[1] for k in range(FRAMES)]
-    grays = [gray + 0.005 * rng.standard_normal(gray.shape) for gray, _ in images]
-    depths = {0: [depth_m for _, depth_m in images], LATE_NS: late}
     folder = tmp_path_factory.mktemp("delay")
-    return {at: write(folder / str(at), grays, depth_m, rng) for at, depth_m in depths.items()}
 
+    def images(late_ns: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [(render(walk(k))[0], render(walk(k - late_ns / FRAME_NS))[1]) for k in range(FRAMES)]
 
-def write(
-    folder: Path, grays: list[np.ndarray], depths_m: list[np.ndarray], rng: np.random.Generator
-) -> Path:
-    with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
-        for k, (gray, depth_m) in enumerate(zip(grays, depths_m, strict=True)):
-            image = np.repeat(np.rint(np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2)
-            raw = np.rint((depth_m + 0.003 * rng.standard_normal(depth_m.shape)) / 0.0005).astype(np.uint16)
-            robot.add_frame(k * FRAME_NS, cv2.imencode(".png", image)[1].tobytes(), "png", raw)
-    return folder / "alpha.mcap"
+    return {late_ns: write(folder / str(late_ns), CAMERA, images(late_ns)) for late_ns in (0, LATE_NS)}
 
 
 def found_ns(path: Path, config: DelayConfig = CONFIG) -> int:
     """The delay of a log by the true path."""
-    stamps = np.array([k * FRAME_NS for k in range(FRAMES)])
     with open_rgbd(path) as log:
-        return certain_delay_ns(log, [Trajectory(stamps, np.array([walk(k) for k in range(FRAMES)]))], config)
+        return certain_delay_ns(log, [true_path(FRAMES)], config)
 
 
 def test_a_delay_is_found(logs: dict[int, Path]) -> None:
@@ -81,9 +55,7 @@ def test_what_the_stamps_say_is_no_delay(logs: dict[int, Path]) -> None:
     with open_rgbd(logs[LATE_NS]) as log:
         log.delay_depth(LATE_NS)
         assert log.frame(8).depth_offset_ns == FRAME_NS - LATE_NS  # the next depth is nearer now
-        stamps = np.array([k * FRAME_NS for k in range(FRAMES)])
-        path = Trajectory(stamps, np.array([walk(k) for k in range(FRAMES)]))
-        assert certain_delay_ns(log, [path], CONFIG) == 0
+        assert certain_delay_ns(log, [true_path(FRAMES)], CONFIG) == 0
         log.delay_depth(0)
         assert log.frame(8).depth_offset_ns == 0
 
@@ -94,10 +66,7 @@ def test_the_front_end_moves_depth_by_it(logs: dict[int, Path], tmp_path: Path) 
         config = FRONTEND.model_copy(update={"delay": DelayConfig(enabled=enabled)})
         out = tmp_path / f"{enabled}.mcap"
         run_frontend(logs[LATE_NS], out, config)
-        frames = [record.message() for record in read_log(out, (topics.ODOMETRY.of("alpha"),))]
-        T_first = se3.inverse(walk(0))
-        apart = [se3.distance(f.T_map_camera, T_first @ walk(f.frame_index))[0] for f in frames]
-        errors_m[enabled] = float(np.sqrt(np.mean(np.square(apart))))
+        errors_m[enabled] = rms_error_m(out)
     assert depth_delay_ns(tmp_path / "False.mcap") == 0
     assert depth_delay_ns(tmp_path / "True.mcap") == pytest.approx(LATE_NS, abs=4_000_000)
     assert errors_m[True] < 0.5 * errors_m[False]

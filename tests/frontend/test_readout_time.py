@@ -4,41 +4,26 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import FrontendConfig, ReadoutConfig, TrackingConfig
 from duagc.pipeline.frontend.readout_time import certain_readout
 from duagc.pipeline.frontend.stage import run_frontend
-from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.trajectory import Trajectory
-from duagc.pipeline.recording import open_rgbd, read_log
-from duagc.pipeline.recording.rolling_shutter import COLOR_READOUT_KEY, Readout, line_times_ns
-from duagc.schemas import topics
-from tests.fixtures.room import pose, render
+from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.recording.rolling_shutter import Readout, line_times_ns
+from tests.fixtures.carried_camera import FRAME_NS, rms_error_m, true_path, walk, write
+from tests.fixtures.room import render
 
 CAMERA = PinholeCamera(240, 180, 195.0, 195.0, 119.5, 89.5)
-FRAMES, FRAME_NS = 46, 33_333_333
+FRAMES = 46
 READOUT_S, ABOUT_S = 0.03, 0.008
 BAND = 20  # rows, or columns, that are rendered at one time
 CONFIG = ReadoutConfig(pairs=46)
 FRONTEND = FrontendConfig(
     tracking=TrackingConfig(strides=(2, 1, 1, 1)), mapping_enabled=False, readout=CONFIG
 )
-
-
-def walk(k: float) -> np.ndarray:
-    """To and fro, so that the velocity changes."""
-    return pose(
-        x=0.10 * np.sin(0.33 * k),
-        y=0.03 * np.sin(0.5 * k + 1),
-        z=-0.9 + 0.05 * np.sin(0.24 * k),
-        yaw=0.10 * np.sin(0.28 * k + 2),
-        pitch=0.05 * np.sin(0.41 * k),
-    )
 
 
 @cache
@@ -70,34 +55,20 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "upside down": Readout(-READOUT_S, -READOUT_S),
         "turned": Readout(READOUT_S, by_columns=True),
     }
-    return {name: write(folder / name, readout) for name, readout in kinds.items()}
+    return {name: write(folder / name, CAMERA, images(readout)) for name, readout in kinds.items()}
 
 
-def write(
-    folder: Path, readout: Readout, sensors: dict[str, str] | None = None, frames: int = FRAMES
-) -> Path:
-    rng = np.random.default_rng(0)
-    with (
-        RecordingWriter(folder) as recording,
-        recording.robot("alpha", CAMERA, 0.0005, sensors, find_regions=False) as robot,
-    ):
-        for k in range(frames):
-            gray = read(k, readout.color_s, readout.by_columns)[0]
-            depth_m = read(k, readout.depth_s, readout.by_columns)[1]
-            gray = gray + 0.005 * rng.standard_normal(gray.shape)
-            image = np.repeat(np.rint(np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2)
-            raw = np.rint((depth_m + 0.003 * rng.standard_normal(depth_m.shape)) / 0.0005).astype(np.uint16)
-            robot.add_frame(k * FRAME_NS, cv2.imencode(".png", image)[1].tobytes(), "png", raw)
-    return folder / "alpha.mcap"
+def images(readout: Readout, frames: int = FRAMES) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Gray images and depth of a log that is read so."""
+    times_s, by_columns = (readout.color_s, readout.depth_s), readout.by_columns
+    read_each = [[read(k, time_s, by_columns) for time_s in times_s] for k in range(frames)]
+    return [(color[0], depth[1]) for color, depth in read_each]
 
 
 def found(path: Path, config: ReadoutConfig = CONFIG) -> Readout:
     """The readout of a log by the true path."""
-    stamps = np.array([k * FRAME_NS for k in range(FRAMES)])
     with open_rgbd(path) as log:
-        readout = certain_readout(
-            log, [Trajectory(stamps, np.array([walk(k) for k in range(FRAMES)]))], config
-        )
+        readout = certain_readout(log, [true_path(FRAMES)], config)
         assert not log.readout.rolls
         return readout
 
@@ -127,7 +98,7 @@ def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
     assert not found(path, CONFIG.model_copy(update={"min_pairs": 1000})).rolls
     assert not found(path, CONFIG.model_copy(update={"enabled": False})).rolls
     assert not found(path, CONFIG.model_copy(update={"least_move": 0.5})).rolls
-    stated = write(tmp_path / "stated", Readout(READOUT_S), {COLOR_READOUT_KEY: "0"}, frames=3)
+    stated = write(tmp_path / "stated", CAMERA, images(Readout(READOUT_S), frames=3), Readout().notes())
     with open_rgbd(stated) as log:
         assert log.states_readout
         assert not certain_readout(log, [], CONFIG).rolls
@@ -136,10 +107,7 @@ def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
 def test_the_front_end_makes_images_still_by_it(logs: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "frontend.mcap"
     run_frontend(logs["color"], out, FRONTEND)
-    frames = [record.message() for record in read_log(out, (topics.ODOMETRY.of("alpha"),))]
-    T_first = se3.inverse(walk(0))
-    apart = [se3.distance(f.T_map_camera, T_first @ walk(f.frame_index))[0] for f in frames]
-    assert np.sqrt(np.mean(np.square(apart))) < 0.0075  # 0.015 without
+    assert rms_error_m(out) < 0.0075  # 0.015 without
     with open_rgbd(logs["color"]) as log:
         log.move_depth_by(out)
         assert log.readout == Readout.found(out)
