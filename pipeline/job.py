@@ -121,15 +121,16 @@ class Job:
             self.log(self._time_left.line())
 
     def _run(self) -> None:
+        if self.store is not None:  # side by side: stages ask one after the other
+            list(in_order(self._digest, map(self.recording.log, self.recording.robots)))
         if self.plan.has(stages.EVALUATION) and (self.plan.calibrate or not self._is_stored()):
             from duagc.pipeline.evaluation import check_ground_truth
 
             check_ground_truth(self.recording)  # before minutes of work
         (self.folder / "config.toml").write_text(dump_config(self.config))
         self.calibrate()
-        logs = [self.recording.log(robot) for robot in self.recording.robots]
-        for path, found in zip(logs, in_order(self._digest, logs), strict=True):
-            if found != (expected := self.recording.digest(path.name)):
+        for path in map(self.recording.log, self.recording.robots):
+            if (found := self._digest(path)) != (expected := self.recording.digest(path.name)):
                 self.log(
                     f"warning: {path}: has digest {found[:12]}, expected {expected[:12]} as in recording.json"
                 )
