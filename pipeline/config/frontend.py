@@ -343,11 +343,13 @@ class ReadoutConfig(MotionTimeConfig):
 
     least_s: float = Field(default=0.005, ge=0.0)
     """Shorter ones are left."""
-    least_move: float = Field(default=0.0016, ge=0.0)
-    """Least move of the rows of the median frame, in its median pixel, as a share of the width of the image; to put
-    less right costs more time than it is worth."""
+    least_move: float = Field(default=0.0004, ge=0.0)
+    """Least move of the rows of the median frame, in its median pixel, as a share of the width of the image; less is
+    left."""
+    move_to_track_again: float = Field(default=0.0016, ge=0.0)
+    """The same from which on frames are tracked once more, with their rows in one time; a stated readout counts."""
     rounds: int = Field(default=2, ge=1)
-    """How often it is looked for, each time in images that what was found has made still."""
+    """How often it is then looked for, each time in images that what was found has made still."""
 
 
 class SubmapConfig(GeometricVerificationConfig):

@@ -8,7 +8,8 @@ velocities v and w (right tangents per second), the two motions then differ by r
 the differences of b and a between the halves (`motion_differences`). Where the velocity does not change, a readout
 cannot be distinguished from another lens, and harms as little.
 
-In images that what was found has made still, what is left is looked for again, until it may be chance.
+In images that what was found has made still, what is left is looked for again, until it may be chance: where rows
+move far, the path that was tracked in rolling images bends with them.
 """
 
 from __future__ import annotations
@@ -61,12 +62,12 @@ class _Half:
     """The upper, lower, left or right half of an image, seen by another one.
 
     Attributes:
-        pyramid: of the image with the depth of this half alone.
+        reference: of the image with the depth of this half alone.
         place: mean row, or column, of its points in the image, as a share of all, from -1/2 to 1/2.
         place_seen: the same in the other image.
     """
 
-    pyramid: RgbdPyramid
+    reference: Reference
     place: float
     place_seen: float
 
@@ -86,8 +87,10 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
         return Readout()
     longest_s = min(LONGEST_S, _interval_s(log))
     longest = [Readout(longest_s, longest_s, by_columns) for by_columns in ORIENTATIONS]
-    if max(_moved(log, readout, parts) for readout in longest) < config.least_move:
+    most = max(_moved(log, readout, parts) for readout in longest)
+    if most < config.least_move:
         return Readout()
+    rounds = config.rounds if most >= config.move_to_track_again else 1
     pairs = list(view_pairs(log, parts, config.pairs))
     with _made_still(log, Readout(), parts):
         first = _estimated(log, pairs, config, ORIENTATIONS)
@@ -96,7 +99,7 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
         if any(certain):
             found = Readout(by_columns=readout.by_columns)
             found = _added(found, first[readout.by_columns], certain, longest_s)
-            for _ in range(config.rounds - 1):
+            for _ in range(rounds - 1):
                 with _made_still(log, found, parts):
                     left = _estimated(log, pairs, config, (readout.by_columns,))[readout.by_columns]
                 found = _added(found, left, certain, longest_s)
@@ -121,12 +124,27 @@ def _interval_s(log: RgbdLog) -> float:
     return 1e-9 * float(np.percentile(np.diff(stamps), SHORT_PERCENTILE)) if len(stamps) > 1 else 0.0
 
 
+def moves_rows_far(log: RgbdLog, config: ReadoutConfig) -> bool:
+    """Whether the rows of a log, by its readout and its motion, move so far that it is worth to track it again.
+
+    Args:
+        log: knows how it moved.
+        config: says how far.
+    """
+    return _move(log) >= config.move_to_track_again
+
+
 def _moved(log: RgbdLog, readout: Readout, parts: Sequence[Trajectory]) -> float:
-    """How far the rows of the median frame move in such a time, in its median pixel, as a share of its width."""
+    """`_move` in such a time."""
+    with _made_still(log, readout, parts):
+        return _move(log)
+
+
+def _move(log: RgbdLog) -> float:
+    """How far the rows of the median frame move, in its median pixel, as a share of its width."""
     used = [index for index in range(len(log)) if not is_held_out(index)]
     some = [used[k] for k in evenly_spaced(len(used), min(MOVED_FRAMES, len(used)))]
-    with _made_still(log, readout, parts):
-        return float(np.median([log.moved_rows_px(index) for index in some])) / log.camera.width
+    return float(np.median([log.moved_rows_px(index) for index in some])) / log.camera.width
 
 
 def _added(
@@ -180,7 +198,8 @@ def _half(
         return None
     here, there = (u[index], column) if by_columns else (v[index], row)
     pyramid = pyramid_of(replace(frame, depth=depth_m), camera, LEVELS)
-    return _Half(RgbdPyramid(pyramid.levels[1:]), _place(here, lines), _place(there, lines))
+    reference = Reference.from_pyramid(RgbdPyramid(pyramid.levels[1:]), STRIDES)
+    return _Half(reference, _place(here, lines), _place(there, lines))
 
 
 def _place(at: NDArray[np.int64], lines: int) -> float:
@@ -202,7 +221,7 @@ def _difference(
     for half in halves:
         if half is None:
             return None
-        registered = register(Reference.from_pyramid(half.pyramid, STRIDES), target, T_start, kind)
+        registered = register(half.reference, target, T_start, kind)
         if registered.outcome not in MEASURED:
             return None
         found.append((half, registered))

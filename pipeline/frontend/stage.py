@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import SupportsIndex
 
@@ -43,7 +44,7 @@ from duagc.pipeline.frontend.output import (
     submap_messages,
     write_log,
 )
-from duagc.pipeline.frontend.readout_time import certain_readout
+from duagc.pipeline.frontend.readout_time import certain_readout, moves_rows_far
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
@@ -209,10 +210,12 @@ class _Tracking:
         return certain_readout(self.log, trajectories_of(tracked), self.config.readout)
 
     def _again(self, tracked: TrackedLog) -> TrackedLog:
-        if self.log.needs_motion and tracked.submaps[0].keyframes:
-            self.log.move_depth(*trajectories_of(tracked))
-            return self._frames("tracking again")
-        return tracked
+        log = self.log
+        if not (log.needs_motion and tracked.submaps[0].keyframes):
+            return tracked
+        log.move_depth(*trajectories_of(tracked))
+        late = bool(log.pairing.largest_offset_ns)
+        return self._frames("tracking again") if late or moves_rows_far(log, self.config.readout) else tracked
 
     def _frames(self, part: str) -> TrackedLog:
         log, save = self.log, self.checkpoints
@@ -298,7 +301,8 @@ class _ComponentStage:
             log.move_depth(tracked_path(frames, solution.T_map_keyframe))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
         part = f"{self.name}.exposures"
-        estimation = ExposureEstimation(log.frame, log.camera, self.config.exposure, save, part)
+        read = partial(log.frame, still=False)  # blocks of colors are larger than what rows move by
+        estimation = ExposureEstimation(read, log.camera, self.config.exposure, save, part)
         exposures = save.done(
             part,
             lambda: estimation.run(

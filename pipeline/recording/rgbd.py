@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
-from duagc.pipeline.geometry import masks, se3
+from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import MAX_SIDE_PX, PinholeCamera
 from duagc.pipeline.geometry.open_shutter import OpenShutter
 from duagc.pipeline.geometry.trajectory import Trajectory
@@ -22,7 +22,7 @@ from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, mo
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile, Record
 from duagc.pipeline.recording.rgbd_frame import RgbdFrame
-from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, all_lines, known_lines, line_times_ns
+from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, unrollings
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.schemas import topics as topic_table
 
@@ -253,11 +253,12 @@ class RgbdLog:
         for index in range(len(self)):
             yield self.frame(index)
 
-    def frame(self, index: int) -> RgbdFrame:
+    def frame(self, index: int, *, still: bool = True) -> RgbdFrame:
         """Read one frame.
 
         Args:
             index: position in the log, 0 <= index < len(self).
+            still: put rows that were read one after the other into one time; if not, they are as they were read.
 
         Raises:
             DuagError: an image is damaged; the line names file, topic and time.
@@ -265,7 +266,7 @@ class RgbdLog:
         """
         stamp, depth_stamp = self._stamps(index)
         image = self._decode_color(self._log.record_at(self._color_topic, self._color_at[stamp]))
-        geometry = self._geometry(stamp, depth_stamp)
+        geometry = self._geometry(stamp, depth_stamp, self.readout if still else Readout())
         mask, found = geometry.mask, geometry.depth
         if geometry.color_unrolling is not None:
             image = geometry.color_unrolling.color(image)
@@ -296,7 +297,7 @@ class RgbdLog:
             DuagError: an image is damaged; the line names file, topic and time.
             IndexError: there are fewer frames.
         """
-        found = self._geometry(*self._stamps(index))
+        found = self._geometry(*self._stamps(index), self.readout)
         return masks.masked_depth(self._of_scene(found.depth.depth_m), found.mask)
 
     def _stamps(self, index: int) -> tuple[int, int | None]:
@@ -305,30 +306,27 @@ class RgbdLog:
             raise IndexError(f"frame {index} of {len(self)}")
         return self.pairing.pairs[index]
 
-    def _geometry(self, color_ns: int, depth_ns: int | None) -> _Geometry:
-        """What a frame has besides its color."""
-        mask = self._mask_of(color_ns)
-        depth, moved = self._depth_of(color_ns, depth_ns)
-        unrolling = self._unrolling(color_ns, color_ns, self.readout.color_s, depth)
-        usable = mask if unrolling is None else unrolling.usable(mask)
-        return _Geometry(depth, moved, usable, mask is not None, unrolling)
+    def _geometry(self, color_ns: int, depth_ns: int | None, readout: Readout) -> _Geometry:
+        """What a frame has besides its color; readout: by which its rows are put into one time."""
+        mask, read = self._mask_of(color_ns), self._read_depth(depth_ns)
+        of_color, of_depth = self._unrollings(color_ns, depth_ns, readout, read)
+        depth, moved = read, False
+        if of_depth is not None and of_depth.is_needed:
+            depth, moved = of_depth.depth(DepthImage(self._of_scene(read.depth_m), read.sigma_m)), True
+        if self._motion is not None and depth_ns not in (None, color_ns):
+            T_color_depth = self._motion.between(color_ns, depth_ns)
+            moved = T_color_depth is not None
+            if T_color_depth is not None:
+                seen = DepthImage(self._of_scene(depth.depth_m), depth.sigma_m)
+                depth = move_depth(seen, self.camera, T_color_depth)
+        if of_color is None or not of_color.is_needed:
+            return _Geometry(depth, moved, mask, mask is not None, None)
+        return _Geometry(depth, moved, of_color.usable(mask), mask is not None, of_color)
 
-    def _depth_of(self, color_ns: int, depth_ns: int | None) -> tuple[DepthImage, bool]:
-        """The depth of a frame, and whether it was moved into the time of the color."""
+    def _read_depth(self, depth_ns: int | None) -> DepthImage:
         if depth_ns is None:
-            return DepthImage(np.zeros((self.camera.height, self.camera.width), dtype=np.float32)), False
-        found = self._source.read(self._log.record_at(self._source.topic, self._depth_at[depth_ns]))
-        if self._motion is None:
-            return found, False
-        if (still := self._unrolling(color_ns, depth_ns, self.readout.depth_s, found)) is not None:
-            found = still.depth(DepthImage(self._of_scene(found.depth_m), found.sigma_m))
-        if depth_ns == color_ns:
-            return found, still is not None
-        T_color_depth = self._motion.between(color_ns, depth_ns)
-        if T_color_depth is None:
-            return found, False
-        seen = DepthImage(self._of_scene(found.depth_m), found.sigma_m)
-        return move_depth(seen, self.camera, T_color_depth), True
+            return DepthImage(np.zeros((self.camera.height, self.camera.width), dtype=np.float32))
+        return self._source.read(self._log.record_at(self._source.topic, self._depth_at[depth_ns]))
 
     def moved_rows_px(self, index: int) -> float:
         """How far the median pixel of a frame, as it was read, lies from where a still camera has it.
@@ -336,29 +334,18 @@ class RgbdLog:
         Args:
             index: position in the log, 0 <= index < len(self).
         """
-        stamp, depth_stamp = self._stamps(index)
-        depth, _ = self._depth_of(stamp, depth_stamp)
-        found = [self._rolling(stamp, stamp, s, depth) for s in (self.readout.color_s, self.readout.depth_s)]
-        return max((rolling.move_px for rolling in found if rolling is not None), default=0.0)
+        times = self._stamps(index)
+        found = self._unrollings(*times, self.readout, self._read_depth(times[1]))
+        return max((unrolling.move_px for unrolling in found if unrolling is not None), default=0.0)
 
-    def _unrolling(
-        self, color_ns: int, taken_ns: int, readout_s: float, depth: DepthImage
-    ) -> Unrolling | None:
-        """How an image that was read around a time is made still; None where it is, or no pose says how it moved."""
-        found = self._rolling(color_ns, taken_ns, readout_s, depth)
-        return None if found is None or not found.is_needed else found
-
-    def _rolling(self, color_ns: int, taken_ns: int, readout_s: float, depth: DepthImage) -> Unrolling | None:
-        """The same of any image whose rows are of different times."""
-        if self._motion is None or readout_s == 0:
-            return None
-        count = self.readout.lines(self.camera)
-        lines_ns = taken_ns + line_times_ns(known_lines(count), count, readout_s)
-        T_color_then = self._motion.at(color_ns, np.append(lines_ns, taken_ns))
-        if T_color_then is None:
-            return None
-        T_middle_line = all_lines(se3.inverse(T_color_then[-1]) @ T_color_then[:-1], count)
-        return Unrolling(self.camera, T_middle_line, depth.depth_m, by_columns=self.readout.by_columns)
+    def _unrollings(
+        self, color_ns: int, depth_ns: int | None, readout: Readout, depth: DepthImage
+    ) -> tuple[Unrolling | None, Unrolling | None]:
+        """How color and depth of a frame are made still."""
+        if self._motion is None or not readout.rolls:
+            return None, None
+        times_ns = color_ns, color_ns if depth_ns is None else depth_ns
+        return unrollings(self._motion, self.camera, times_ns, readout, depth_m=depth.depth_m)
 
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [H, W] with 0 where the camera never shows the scene."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording.depth_sources import DepthImage
+from duagc.pipeline.recording.moved_depth import DepthMotion
 from duagc.pipeline.recording.read import log_metadata
 
 Image = NDArray[np.float32]
@@ -152,37 +153,54 @@ def all_lines(T_middle_line: Array, count: int) -> Array:
     )
 
 
-class Unrolling:
-    """Where in a rolling image each pixel of a still one is."""
+class SeenPoints:
+    """Points that some pixels of an image show, by which it is known how far its rows moved: parallax by depth."""
 
-    def __init__(
-        self, camera: PinholeCamera, T_middle_line: Array, depth_m: Image, *, by_columns: bool = False
-    ) -> None:
+    def __init__(self, camera: PinholeCamera, depth_m: Image) -> None:
         """Set up.
 
         Args:
-            camera: of the images.
+            camera: of the image.
+            depth_m: depth [h, w] of about its time, 0 = unknown: that of a point is the mean over a neighborhood.
+        """
+        rows, columns = _steps(camera.height), _steps(camera.width)
+        self.camera = camera
+        self.u, self.v = np.meshgrid(columns, rows)
+        x, y = (self.u - camera.cx) / camera.fx, (self.v - camera.cy) / camera.fy
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+        self.points = rays / _mean_inverse(depth_m, rows, columns)[..., None]
+
+
+class Unrolling:
+    """Where in a rolling image each pixel of a still one is."""
+
+    def __init__(self, seen: SeenPoints, T_middle_line: Array, *, by_columns: bool = False) -> None:
+        """Set up.
+
+        Args:
+            seen: in the image.
             T_middle_line: [h, 4, 4], from the camera when a row was taken to the camera in the middle of the readout;
                 by columns [w, 4, 4].
-            depth_m: depth [h, w] of about that time, 0 = unknown: parallax is that of its means over a neighborhood.
             by_columns: whether columns were read one after the other.
         """
+        camera, u, v = seen.camera, seen.u, seen.v
         self._camera, self._by_columns = camera, by_columns
         self._T_line_middle = se3.inverse(T_middle_line)
-        rows, columns = _steps(camera.height), _steps(camera.width)
-        u, v = np.meshgrid(columns, rows)
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-        points = rays / _mean_inverse(depth_m, rows, columns)[..., None]
         found_u, found_v = u, v
         for _ in range(ROUNDS):
             line = np.rint(found_u if by_columns else found_v).astype(np.int64)
             T = self._T_line_middle[np.clip(line, 0, len(self._T_line_middle) - 1)]
-            there = np.einsum("...ij,...j->...i", T[..., :3, :3], points) + T[..., :3, 3]
+            there = np.einsum("...ij,...j->...i", T[..., :3, :3], seen.points) + T[..., :3, 3]
             found_u = camera.fx * there[..., 0] / there[..., 2] + camera.cx
             found_v = camera.fy * there[..., 1] / there[..., 2] + camera.cy
         moved = np.stack([found_u - u, found_v - v], axis=-1)
         self.move_px = float(np.median(np.hypot(moved[..., 0], moved[..., 1])))
-        self._u, self._v = _interpolated(moved.astype(np.float32), camera.height, camera.width)
+        self._moved = moved.astype(np.float32)
+
+    @cached_property
+    def _pixels(self) -> tuple[Image, Image]:
+        """Columns and rows [h, w] in the rolling image."""
+        return _interpolated(self._moved, self._camera.height, self._camera.width)
 
     @property
     def is_needed(self) -> bool:
@@ -197,9 +215,9 @@ class Unrolling:
         """
         import cv2
 
-        return np.asarray(
-            cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        )
+        four = cv2.cvtColor(image, cv2.COLOR_RGB2RGBA)  # interpolated in half the time of three channels
+        moved = cv2.remap(four, *self._pixels, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(cv2.cvtColor(moved, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
 
     def usable(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
         """Pixels [h, w] that the rolling image shows, all of whose neighbors there may be used.
@@ -210,10 +228,11 @@ class Unrolling:
         import cv2
 
         camera = self._camera
-        inside = cv2.inRange(self._u, 0.0, camera.width - 1.0), cv2.inRange(self._v, 0.0, camera.height - 1.0)
+        u, v = self._pixels
+        inside = cv2.inRange(u, 0.0, camera.width - 1.0), cv2.inRange(v, 0.0, camera.height - 1.0)
         shown = cv2.bitwise_and(*inside)
         if mask is not None:
-            usable = cv2.remap(mask.astype(np.float32), self._u, self._v, cv2.INTER_LINEAR)
+            usable = cv2.remap(mask.astype(np.float32), u, v, cv2.INTER_LINEAR)
             shown = cv2.bitwise_and(shown, cv2.inRange(usable, 0.999, 2.0))
         return np.asarray(shown > 0)
 
@@ -228,18 +247,54 @@ class Unrolling:
         camera = self._camera
 
         def nearest(image: Image) -> Image:
-            return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_NEAREST), dtype=np.float32)
+            return np.asarray(cv2.remap(image, *self._pixels, cv2.INTER_NEAREST), dtype=np.float32)
 
         x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)[None]
         y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)[:, None]
         # z when the row was read, of a point now
         third = self._T_line_middle[:, 2].astype(np.float32)
-        third = third[None] if self._by_columns else third[:, None]
+        by_x, by_y, by_z, ahead = np.moveaxis(third[None] if self._by_columns else third[:, None], -1, 0)
+        per_z = by_y * y + (by_x * x + by_z) if self._by_columns else by_x * x + (by_y * y + by_z)
         read_m = nearest(depth.depth_m)
-        z = (read_m - third[..., 3]) / (third[..., 0] * x + third[..., 1] * y + third[..., 2])
-        found = np.where((read_m > 0) & (z > 0), z, np.float32(0)).astype(np.float32)
+        z = read_m - ahead
+        z /= per_z
+        found = np.where((read_m > 0) & (z > 0), z, np.float32(0))
         sigma = None if depth.sigma_m is None else np.where(found > 0, nearest(depth.sigma_m), np.float32(0))
         return DepthImage(found, sigma)
+
+
+def unrollings(
+    motion: DepthMotion,
+    camera: PinholeCamera,
+    times_ns: tuple[int, int],
+    readout: Readout,
+    *,
+    depth_m: Image,
+) -> tuple[Unrolling | None, Unrolling | None]:
+    """How color and depth of a frame are made still; None where rows are of one time, or nothing says how it moved.
+
+    Args:
+        motion: of the camera.
+        camera: of both.
+        times_ns: of color and of depth, each in the middle of its readout.
+        readout: of both.
+        depth_m: depth [h, w] as it was read, 0 = unknown.
+    """
+    count, by_columns = readout.lines(camera), readout.by_columns
+    lines = known_lines(count)
+    readouts_s = readout.color_s, readout.depth_s
+    times = [t + line_times_ns(lines, count, s) for t, s in zip(times_ns, readouts_s, strict=True)]
+    T_color_then = motion.at(times_ns[0], np.concatenate([*times, times_ns]))
+    if T_color_then is None or not readout.rolls:
+        return None, None
+    seen, T_color_middle = SeenPoints(camera, depth_m), T_color_then[-2:]
+    found: list[Unrolling | None] = []
+    for T_middle, T_line, readout_s in zip(
+        T_color_middle, np.split(T_color_then[:-2], 2), readouts_s, strict=True
+    ):
+        T_middle_line = all_lines(se3.inverse(T_middle) @ T_line, count)
+        found.append(Unrolling(seen, T_middle_line, by_columns=by_columns) if readout_s else None)
+    return found[0], found[1]
 
 
 def _steps(size: int) -> Array:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig, ReadoutConfig, TrackingConfig
 from duagc.pipeline.frontend.readout_time import certain_readout
 from duagc.pipeline.frontend.stage import run_frontend
@@ -104,15 +105,34 @@ def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
         assert not certain_readout(log, [], CONFIG).rolls
 
 
+def parts_of(path: Path, out: Path, config: FrontendConfig) -> set[str]:
+    """Run the front end; names of what it did."""
+    parts = set[str]()
+    checkpoints = Checkpoints(report=lambda name, *_: parts.add(name))
+    run_frontend(path, out, config, checkpoints=checkpoints)
+    return parts
+
+
+def test_frames_are_tracked_once_where_rows_move_little(logs: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "frontend.mcap"
+    far = CONFIG.model_copy(update={"move_to_track_again": 0.5})
+    assert "tracking again" not in parts_of(logs["color"], out, FRONTEND.model_copy(update={"readout": far}))
+    readout = Readout.found(out)
+    assert readout is not None
+    assert readout.color_s == pytest.approx(READOUT_S, abs=ABOUT_S)
+
+
 def test_the_front_end_makes_images_still_by_it(logs: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "frontend.mcap"
-    run_frontend(logs["color"], out, FRONTEND)
+    assert "tracking again" in parts_of(logs["color"], out, FRONTEND)
     assert rms_error_m(out) < 0.0075  # 0.015 without
     with open_rgbd(logs["color"]) as log:
         log.move_depth_by(out)
         assert log.readout == Readout.found(out)
         assert log.readout.color_s == pytest.approx(READOUT_S, abs=ABOUT_S)
         assert log.readout.depth_s == 0
+        with open_rgbd(logs["color"]) as as_read:
+            assert np.array_equal(log.frame(9, still=False).color, as_read.frame(9).color)
         seen, rolling = log.frame(9).color[..., 0] / 255.0, read(9, READOUT_S)[0]
         usable, still = log.frame(9).mask, render(walk(9), camera=CAMERA)[0]
         assert np.abs(seen - still)[usable].mean() < 0.5 * np.abs(rolling - still)[usable].mean()

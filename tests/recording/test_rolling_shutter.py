@@ -13,7 +13,14 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.recording.depth_sources import DepthImage
-from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, all_lines, known_lines, line_times_ns
+from duagc.pipeline.recording.rolling_shutter import (
+    Readout,
+    SeenPoints,
+    Unrolling,
+    all_lines,
+    known_lines,
+    line_times_ns,
+)
 
 CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 79.5, 59.5)
 TWIST = np.array([0.4, -0.2, 0.3, 0.5, 1.2, -0.4])  # m/s and rad/s, of a hasty hand
@@ -59,7 +66,7 @@ def test_an_image_is_as_a_still_camera_takes_it(by_columns: bool) -> None:
     count = Readout(by_columns=by_columns).lines(CAMERA)
     lines = poses(1e-9 * line_times_ns(np.arange(count), count, READOUT_S))
     color, depth = shot(lines, by_columns)
-    unrolling = Unrolling(CAMERA, lines, depth, by_columns=by_columns)
+    unrolling = Unrolling(SeenPoints(CAMERA, depth), lines, by_columns=by_columns)
     assert unrolling.is_needed
     usable = unrolling.usable(None)
     assert 0.9 < usable.mean() < 1
@@ -73,7 +80,7 @@ def test_an_image_is_as_a_still_camera_takes_it(by_columns: bool) -> None:
 
 def test_what_may_not_be_used_moves_along() -> None:
     _, depth = shot(rows(0.0))
-    unrolling = Unrolling(CAMERA, rows(0.0), depth)
+    unrolling = Unrolling(SeenPoints(CAMERA, depth), rows(0.0))
     mask = np.ones(depth.shape, dtype=bool)
     mask[:, :40] = False
     found = unrolling.usable(mask)
@@ -87,7 +94,7 @@ def test_what_may_not_be_used_moves_along() -> None:
 
 def test_a_camera_that_stands_changes_nothing() -> None:
     depth = np.full((120, 160), 2.0, np.float32)
-    assert not Unrolling(CAMERA, np.tile(np.eye(4), (120, 1, 1)), depth).is_needed
+    assert not Unrolling(SeenPoints(CAMERA, depth), np.tile(np.eye(4), (120, 1, 1))).is_needed
 
 
 @pytest.mark.parametrize("text", ["-0.01", "30", "fast", "nan"])
