@@ -135,7 +135,9 @@ def test_stereo_is_tracked_better_by_its_sigma_than_by_a_sensor_model(
 ) -> None:
     odometry, _, error_m = mapped["stereo"]  # maps change no pose: tests/bench/test_frontend.py
     frame = RgbdLog.frame
-    monkeypatch.setattr(RgbdLog, "frame", lambda log, k: replace(frame(log, k), depth_sigma=None))
+    monkeypatch.setattr(
+        RgbdLog, "frame", lambda log, k, **options: replace(frame(log, k, **options), depth_sigma=None)
+    )
     model, _, without_m = followed(walk, "stereo", tmp_path / "model.mcap", False)
     assert len(odometry) == FRAMES
     print(error_m, without_m, len(model))
