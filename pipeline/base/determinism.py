@@ -13,7 +13,7 @@ import os
 import sys
 from pathlib import Path
 
-_KEPT_BYTES = 256 << 20
+_KEPT_BYTES = 256 << 20  # of freed memory: features of a VGA image take 100 MB, and as much the next time
 _OWN_MAPPING_BYTES = 32 << 20  # what is larger is given back at once
 _SKX = {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"}  # what OpenCV calls AVX512-SKX
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from duagc.pipeline.config.frontend import DelayConfig
+from duagc.pipeline.config.motion_times import DelayConfig
 from duagc.pipeline.frontend.frame_images import pyramid_of
 from duagc.pipeline.frontend.motion_differences import (
     BY_COLOR,

@@ -19,7 +19,7 @@ import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.held_out import is_held_out
-from duagc.pipeline.config.frontend import MotionTimeConfig
+from duagc.pipeline.config.motion_times import MotionTimeConfig
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.statistics import evenly_spaced

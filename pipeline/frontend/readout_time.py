@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.held_out import is_held_out
-from duagc.pipeline.config.frontend import ReadoutConfig
+from duagc.pipeline.config.motion_times import ReadoutConfig
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.frontend.frame_images import pyramid_of
 from duagc.pipeline.frontend.motion_differences import (
@@ -86,24 +86,24 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
     if not config.enabled or log.states_readout or has_sigma(log):
         return Readout()
     longest_s = min(LONGEST_S, _interval_s(log))
-    longest = [Readout(longest_s, longest_s, by_columns) for by_columns in ORIENTATIONS]
-    most = max(_moved(log, readout, parts) for readout in longest)
+    most = max(_moved(log, Readout(longest_s, longest_s, by_columns), parts) for by_columns in ORIENTATIONS)
     if most < config.least_move:
         return Readout()
     rounds = config.rounds if most >= config.move_to_track_again else 1
     pairs = list(view_pairs(log, parts, config.pairs))
     with _made_still(log, Readout(), parts):
         first = _estimated(log, pairs, config, ORIENTATIONS)
-    for readout in longest:
-        certain = [time is not None and time.is_certain(config) for time in first[readout.by_columns]]
-        if any(certain):
-            found = Readout(by_columns=readout.by_columns)
-            found = _added(found, first[readout.by_columns], certain, longest_s)
-            for _ in range(rounds - 1):
-                with _made_still(log, found, parts):
-                    left = _estimated(log, pairs, config, (readout.by_columns,))[readout.by_columns]
-                found = _added(found, left, certain, longest_s)
-            return found if _moved(log, found, parts) >= config.least_move else Readout()
+    for by_columns in ORIENTATIONS:
+        left = first[by_columns]
+        certain = [time is not None and time.is_certain(config) for time in left]
+        if not any(certain):
+            continue
+        found = _added(Readout(by_columns=by_columns), left, certain, longest_s)
+        for _ in range(rounds - 1):
+            with _made_still(log, found, parts):
+                left = _estimated(log, pairs, config, (by_columns,))[by_columns]
+            found = _added(found, left, certain, longest_s)
+        return found if _moved(log, found, parts) >= config.least_move else Readout()
     return Readout()
 
 

@@ -177,7 +177,7 @@ class _Tracking:
     progress: bool
 
     def run(self) -> TrackedLog:
-        """Track; where depth or rows are of other times, again with them moved by the first result."""
+        """Track; where depth is of other times, or rows move far, again with them moved by the first result."""
         log, save = self.log, self.checkpoints
         first = save.done("tracked first", lambda: self._frames("tracking"))
         if delay_ns := save.done("delay", lambda: self._delay_ns(first)):

@@ -342,7 +342,7 @@ class RgbdLog:
         self, color_ns: int, depth_ns: int | None, readout: Readout, depth: DepthImage
     ) -> tuple[Unrolling | None, Unrolling | None]:
         """How color and depth of a frame are made still."""
-        if self._motion is None or not readout.rolls:
+        if self._motion is None:
             return None, None
         times_ns = color_ns, color_ns if depth_ns is None else depth_ns
         return unrollings(self._motion, self.camera, times_ns, readout, depth_m=depth.depth_m)

@@ -154,7 +154,14 @@ def all_lines(T_middle_line: Array, count: int) -> Array:
 
 
 class SeenPoints:
-    """Points that some pixels of an image show, by which it is known how far its rows moved: parallax by depth."""
+    """Points that some pixels of an image show, by which it is known how far its rows moved: parallax by depth.
+
+    Attributes:
+        camera: of the image.
+        u: columns [k, l] of the pixels, every `STEP_PX` from one beyond either border.
+        v: rows [k, l].
+        points: [k, l, 3], meters, camera frame.
+    """
 
     def __init__(self, camera: PinholeCamera, depth_m: Image) -> None:
         """Set up.
@@ -166,9 +173,7 @@ class SeenPoints:
         rows, columns = _steps(camera.height), _steps(camera.width)
         self.camera = camera
         self.u, self.v = np.meshgrid(columns, rows)
-        x, y = (self.u - camera.cx) / camera.fx, (self.v - camera.cy) / camera.fy
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
-        self.points = rays / _mean_inverse(depth_m, rows, columns)[..., None]
+        self.points = camera.rays_at(self.u, self.v) / _mean_inverse(depth_m, rows, columns)[..., None]
 
 
 class Unrolling:
@@ -191,8 +196,7 @@ class Unrolling:
             line = np.rint(found_u if by_columns else found_v).astype(np.int64)
             T = self._T_line_middle[np.clip(line, 0, len(self._T_line_middle) - 1)]
             there = np.einsum("...ij,...j->...i", T[..., :3, :3], seen.points) + T[..., :3, 3]
-            found_u = camera.fx * there[..., 0] / there[..., 2] + camera.cx
-            found_v = camera.fy * there[..., 1] / there[..., 2] + camera.cy
+            found_u, found_v = np.moveaxis(camera.project(there), -1, 0)
         moved = np.stack([found_u - u, found_v - v], axis=-1)
         self.move_px = float(np.median(np.hypot(moved[..., 0], moved[..., 1])))
         self._moved = moved.astype(np.float32)
@@ -280,12 +284,14 @@ def unrollings(
         readout: of both.
         depth_m: depth [h, w] as it was read, 0 = unknown.
     """
+    if not readout.rolls:
+        return None, None
     count, by_columns = readout.lines(camera), readout.by_columns
     lines = known_lines(count)
     readouts_s = readout.color_s, readout.depth_s
     times = [t + line_times_ns(lines, count, s) for t, s in zip(times_ns, readouts_s, strict=True)]
     T_color_then = motion.at(times_ns[0], np.concatenate([*times, times_ns]))
-    if T_color_then is None or not readout.rolls:
+    if T_color_then is None:
         return None, None
     seen, T_color_middle = SeenPoints(camera, depth_m), T_color_then[-2:]
     found: list[Unrolling | None] = []

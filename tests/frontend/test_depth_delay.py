@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.frontend import DelayConfig, FrontendConfig, TrackingConfig
+from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
+from duagc.pipeline.config.motion_times import DelayConfig
 from duagc.pipeline.frontend.depth_delay import certain_delay_ns
 from duagc.pipeline.frontend.motion_differences import MotionDifference, estimated_time
 from duagc.pipeline.frontend.stage import run_frontend

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.base.checkpoints import Checkpoints
-from duagc.pipeline.config.frontend import FrontendConfig, ReadoutConfig, TrackingConfig
+from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
+from duagc.pipeline.config.motion_times import ReadoutConfig
 from duagc.pipeline.frontend.readout_time import certain_readout
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry.camera import PinholeCamera
