@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +38,10 @@ def psnr_of_planes(
         mask: bool [H, W], pixels that count; None: all.
     """
     error = np.clip(rendered, 0, 1) - reference
-    if mask is not None and not mask.all():
-        error = masks.taken(error, mask)
-    return decibels(float(np.mean(np.square(error, out=error), dtype=np.float64)))
+    squares = np.square(error, out=error)
+    if mask is None or mask.all():
+        return decibels(float(np.mean(squares, dtype=np.float64)))
+    return decibels(masks.total(squares, mask) / (len(squares) * np.count_nonzero(mask)))
 
 
 def decibels(mse: float) -> float:
@@ -92,7 +93,7 @@ _STRIP_ROWS = 32  # of windows at a time: what is computed of them stays in the 
 class _Scale:
     """One scale of an image that renders are compared with: colors y; means, their squares and variances of windows.
 
-    `counted`: window positions that count; None: all.
+    `weight`: 1 at window positions that count, else 0, [H, W, C]; None: all count.
     """
 
     y: Image
@@ -100,7 +101,7 @@ class _Scale:
     mean2: Image
     variance: Image
     mask: masks.Mask | None
-    counted: masks.Mask | None
+    weight: Image | None
 
     @staticmethod
     def of(y: Image, mask: masks.Mask | None) -> _Scale:
@@ -111,7 +112,15 @@ class _Scale:
         mean = _window_mean(y)
         mean2 = mean * mean
         variance = _window_mean(y * y) - mean2
-        return _Scale(y, mean, mean2, variance, mask, None if mask is None else counted_windows(mask))
+        weight = None
+        if mask is not None and not (counted := counted_windows(mask)).all():
+            weight = np.where(counted[..., None], np.ones_like(mean), np.float32(0))
+        return _Scale(y, mean, mean2, variance, mask, weight)
+
+    @cached_property
+    def count(self) -> int:
+        """Windows that count, in all channels."""
+        return self.mean.size if self.weight is None else int(np.count_nonzero(self.weight))
 
     def halved(self) -> _Scale:
         """The next scale."""
@@ -124,13 +133,16 @@ class _Scale:
             rows = slice(top, top + _STRIP_ROWS)
             seen = slice(top, top + _STRIP_ROWS + 2 * _WINDOW_RADIUS)
             self._strip(x[seen], self.y[seen], rows, images)
-        if self.counted is not None:
-            if not self.counted.any():
-                raise ValueError("no 11x11 window of SSIM has usable pixels only")
-            if not self.counted.all():
-                images = [masks.taken_pixels(image, self.counted) for image in images]
-        means = [float(np.mean(image, dtype=np.float64)) for image in images]
+        means = [self._mean(image) for image in images]
         return means[-1], means[0]
+
+    def _mean(self, image: Image) -> float:
+        """Mean of what windows say, over those that count."""
+        if self.weight is None:
+            return float(np.mean(image, dtype=np.float64))
+        if not self.count:
+            raise ValueError("no 11x11 window of SSIM has usable pixels only")
+        return float(np.sum(image * self.weight, dtype=np.float64)) / self.count
 
     def _strip(self, x: Image, y: Image, rows: slice, images: Sequence[Image]) -> None:
         """Contrast-structure term of some rows of windows, from the pixels that they see, and SSIM if it has an image.
@@ -179,8 +191,7 @@ class SsimReference:
         """
         if self._mask is None:
             return True
-        counted = (self._scale(k).counted for k in range(scales))
-        return all(bool(one is not None and one.any()) for one in counted)
+        return all(self._scale(k).count for k in range(scales))
 
     def ssim(self, rendered: NDArray) -> float:
         """As the function `ssim`.
@@ -282,5 +293,6 @@ def depth_error(render: Rendered, depth_m: Image, min_alpha: float = 0.5) -> tup
     completeness = count / max(int(np.count_nonzero(measured)), 1)
     if count == 0:
         return float("nan"), completeness
-    error = np.abs(render.depth[covered] / render.alpha[covered] - depth_m[covered])
-    return float(np.mean(error, dtype=np.float64)), completeness
+    error = render.depth / np.maximum(render.alpha, np.float32(min_alpha))
+    error -= depth_m
+    return masks.total(np.abs(error, out=error), covered) / count, completeness

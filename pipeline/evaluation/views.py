@@ -16,7 +16,7 @@ from duagc.pipeline.evaluation import image_metrics
 from duagc.pipeline.evaluation.exposure import fitted_psnr, planes
 from duagc.pipeline.evaluation.image_metrics import SsimReference
 from duagc.pipeline.evaluation.results import Absent, mean
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry import masks, se3
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -188,9 +188,10 @@ def _too_small(side_px: int) -> Absent:
 def _layer(layer_m: NDArray[np.float32], depth_m: NDArray[np.float32]) -> Score:
     """L1 of the depth of one layer over the pixels that have both depths."""
     both = (layer_m > 0) & (depth_m > 0)
-    if not both.any():
+    count = np.count_nonzero(both)
+    if not count:
         return Absent("no pixel has both a layer that stops half of its light and a recorded depth")
-    return float(np.mean(np.abs(layer_m[both] - depth_m[both]), dtype=np.float64))
+    return masks.total(np.abs(layer_m - depth_m), both) / count
 
 
 def _common(render: Render, depth_m: NDArray[np.float32], common: NDArray[np.bool_]) -> Score:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 
 Mask = NDArray[np.bool_]
-Number = TypeVar("Number", bound=np.generic)
 CHECKER = (170, 210)  # grays of the squares that stand for no pixel
 
 
@@ -22,24 +19,14 @@ def halved(mask: Mask) -> Mask:
     return mask[0:h:2, :w:2] & mask[0:h:2, 1:w:2] & mask[1:h:2, :w:2] & mask[1:h:2, 1:w:2]
 
 
-def taken(planes: NDArray[Number], mask: Mask) -> NDArray[Number]:
-    """What the usable pixels show, [n, pixels]; ten times as fast as `planes[:, mask]`.
+def total(planes: NDArray[np.float32], mask: Mask) -> float:
+    """Sum over the usable pixels, float64; twice to three times as fast as taking them out.
 
     Args:
-        planes: [n, H, W].
+        planes: [..., H, W], finite.
         mask: bool [H, W].
     """
-    return np.compress(mask.ravel(), planes.reshape(len(planes), -1), axis=1)
-
-
-def taken_pixels(image: NDArray[Number], mask: Mask) -> NDArray[Number]:
-    """What the usable pixels show, [pixels, n].
-
-    Args:
-        image: [H, W, n].
-        mask: bool [H, W].
-    """
-    return np.compress(mask.ravel(), image.reshape(mask.size, -1), axis=0)
+    return float(np.sum(planes * mask, dtype=np.float64))
 
 
 def masked_depth(depth_m: NDArray[np.floating], mask: Mask | None) -> NDArray[np.float32]:
