@@ -41,6 +41,7 @@ FIRST_SIGMA_S = 1.0  # of a time of which nothing is known
 CHI2_6_MEDIAN = 5.348  # median of chi^2 with 6 degrees of freedom
 ROUNDS = 20  # of reweighting
 PARTS = 5  # of the log, each of which is left out once
+CHANCE_SIGMAS = 2.0  # up to which a time may be chance
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,11 @@ class FoundTime:
 
     time_s: float
     sigma_s: float
+
+    @property
+    def may_be_chance(self) -> bool:
+        """Whether nothing at all may be there."""
+        return abs(self.time_s) <= CHANCE_SIGMAS * self.sigma_s
 
     def is_certain(self, config: MotionTimeConfig) -> bool:
         """Whether it is no chance, and long enough to matter.

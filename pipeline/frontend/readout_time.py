@@ -51,7 +51,6 @@ from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, re
 KINDS = (BY_COLOR, BY_DEPTH)
 ORIENTATIONS = (False, True)  # whether by columns
 STEP_PX = 8  # between the pixels by which the rows of a half are averaged
-CHANCE_SIGMAS = 2.0  # of what is left, below which it is chance
 SHORT_PERCENTILE = 10  # of the times between images
 MOVED_FRAMES = 20  # by which it is known how far rows move
 LEAST_POINTS = 50  # of a half that both frames see
@@ -95,7 +94,7 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
         first = _estimated(log, pairs, config, ORIENTATIONS)
     for by_columns in ORIENTATIONS:
         left = first[by_columns]
-        certain = [time is not None and time.is_certain(config) for time in left]
+        certain = _certain(left, config)
         if not any(certain):
             continue
         found = _added(Readout(by_columns=by_columns), left, certain, longest_s)
@@ -147,13 +146,27 @@ def _move(log: RgbdLog) -> float:
     return float(np.median([log.moved_rows_px(index) for index in some])) / log.camera.width
 
 
+def _certain(times: Sequence[FoundTime | None], config: ReadoutConfig) -> list[bool]:
+    """Whether color and depth are certain to roll; depth only where color seems to roll in its direction.
+
+    Depth errs alike over whole walls, which can look like a readout; and a depth camera with a rolling shutter comes
+    with a color camera that has one, while the reverse is common.
+    """
+    color, depth = times
+    if color is None:
+        return [False, False]
+    if depth is None or color.may_be_chance or color.time_s * depth.time_s < 0:
+        return [color.is_certain(config), False]
+    return [color.is_certain(config), depth.is_certain(config)]
+
+
 def _added(
     readout: Readout, left: Sequence[FoundTime | None], certain: Sequence[bool], longest_s: float
 ) -> Readout:
     """A readout with what is left of it, by kind, where that is certain to roll and what is left is no chance."""
     times_s = [readout.color_s, readout.depth_s]
     for kind, time in enumerate(left):
-        if certain[kind] and time is not None and abs(time.time_s) > CHANCE_SIGMAS * time.sigma_s:
+        if certain[kind] and time is not None and not time.may_be_chance:
             times_s[kind] = float(np.clip(times_s[kind] + time.time_s, -longest_s, longest_s))
     return Readout(times_s[0], times_s[1], readout.by_columns)
 

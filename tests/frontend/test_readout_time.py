@@ -56,6 +56,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "color": Readout(READOUT_S),
         "upside down": Readout(-READOUT_S, -READOUT_S),
         "turned": Readout(READOUT_S, by_columns=True),
+        "depth": Readout(0.0, READOUT_S),
     }
     return {name: write(folder / name, CAMERA, images(readout)) for name, readout in kinds.items()}
 
@@ -81,6 +82,7 @@ def found(path: Path, config: ReadoutConfig = CONFIG) -> Readout:
         ("upside down", -READOUT_S, -READOUT_S),
         ("turned", READOUT_S, 0.0),
         ("none", 0.0, 0.0),
+        ("depth", 0.0, 0.0),  # no such cameras are built: it is an error of depth
     ],
 )
 def test_a_readout_is_found_by_each_camera(
