@@ -70,7 +70,13 @@ struct NoMemory {
     float least() const { return TRANSMITTANCE_MIN; }
     void keep(uint32_t, Vec, Vec) const {}
 };
-// The same where the Gaussian that takes a pixel below `closing` stops all of its light: it is blended with an alpha of 1.
+// Adds the weights up.
+struct WeightSum : NoMemory {
+    Vec* sum;
+    explicit WeightSum(Vec& to) : sum(&to) {}
+    void keep(uint32_t, Vec, Vec weight) const { *sum += weight; }
+};
+// As Memory, where the Gaussian that takes a pixel below `closing` stops all of its light: it is blended with an alpha of 1.
 struct ClosingMemory : Memory {
     static constexpr bool CLOSES = true;
     float closing;
@@ -171,6 +177,19 @@ inline OpenBlock blend_block(const Frame& frame, const Tile& tile, const Splat* 
     store(items.T + b * LANES, image.T);
     items.skip(items.counts[b]);
     return image;
+}
+
+// 1 - T of a block that was blended. Where little is covered few digits of that are left: there it is what `sum_of_weights` returns.
+template <class SumOfWeights>
+ALWAYS_INLINE inline Vec alpha_of(const OpenBlock& image, Mask wanted, SumOfWeights sum_of_weights) {
+    const Vec alpha = Vec(1.0f) - image.T;
+    const Mask little = wanted & (alpha < Vec(0.5f));
+    return any(little) ? select(little, sum_of_weights(), alpha) : alpha;
+}
+inline Vec sum_of_kept(const float* weights, uint32_t count) {
+    Vec sum(0.0f);
+    for (uint32_t k = 0; k < count; k++) sum += load(weights + static_cast<size_t>(k) * LANES);
+    return sum;
 }
 
 }  // namespace KERNEL_ISA

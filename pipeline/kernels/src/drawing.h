@@ -42,13 +42,23 @@ inline void draw_tile(Frame& frame, int index, const Images& images) {
             if constexpr (LAYERED) return LayerMemory{kept, kept + room, &median};
             else return NoMemory();
         }();
+        const TileItems blended = items;
         const OpenBlock image = blend_block<KIND>(frame, tile, splats, b, block, wanted, memory, items, evaluated);
+        const Vec alpha = alpha_of(image, wanted, [&] {
+            const uint32_t count = items.counts[b];
+            if constexpr (LAYERED) return sum_of_kept(memory.weights, count);
+            Vec sum(0.0f);
+            OpenBlock again(block, wanted);
+            uint64_t uncounted = 0;
+            blend_candidates<KIND>(splats, blended, count, tile.count, WeightSum(sum), again, uncounted);
+            return sum;
+        });
         const Vec rgb[3] = {select_or_zero(wanted, fma(image.T, background[0], image.R)),
                             select_or_zero(wanted, fma(image.T, background[1], image.G)),
                             select_or_zero(wanted, fma(image.T, background[2], image.B))};
         write_block_rgb(images.color, block, view, rgb);
         write_block(images.depth, block, view, image.D);
-        write_block(images.alpha, block, view, Vec(1.0f) - image.T);
+        write_block(images.alpha, block, view, alpha);
         if constexpr (LAYERED) write_block(images.layer, block, view, layer_of_block<KIND>(memory, items.counts[b], images.tolerance));
     }
     frame.evaluated.data()[index] = evaluated;

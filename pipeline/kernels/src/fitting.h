@@ -58,10 +58,11 @@ struct LossLanes {
 };
 
 // Cotangents of a block's images, whose loss is added to `sums`.
-inline Cotangents loss_of_block(const OpenBlock& image, const Vec* rgb, const Measured& measured, Mask wanted, const Loss& loss,
-                                const LossScales& scales, LossLanes& sums) {
+// weights: of the `count` items of the block.
+inline Cotangents loss_of_block(const OpenBlock& image, const Vec* rgb, const Measured& measured, Mask wanted, const float* weights,
+                                uint32_t count, const Loss& loss, const LossScales& scales, LossLanes& sums) {
     Cotangents v;
-    const Vec gain(loss.gain), zero(0.0f), one(1.0f);
+    const Vec gain(loss.gain), zero(0.0f);
     for (int k = 0; k < 3; k++) {
         const Huber h(fma(gain, rgb[k], Vec(loss.offset)) - load(measured.planes[k]), loss.color_huber);
         const Vec slope = select_or_zero(wanted, h.slope);
@@ -70,8 +71,9 @@ inline Cotangents loss_of_block(const OpenBlock& image, const Vec* rgb, const Me
         sums.by_offset += slope;
         store(v.planes[k], slope * Vec(loss.gain * scales.per_color));
     }
-    const Vec z = load(measured.planes[3]), alpha = one - image.T;
+    const Vec z = load(measured.planes[3]);
     const Mask has_depth = wanted & (zero < z);
+    const Vec alpha = alpha_of(image, has_depth, [&] { return sum_of_kept(weights, count); });
     const Vec certainty = load(measured.planes[4]);
     const Huber h(fnma(alpha, z, image.D) * certainty, loss.depth_huber_m);
     const Vec by_depth = select_or_zero(has_depth, h.slope * Vec(loss.depth_weight * scales.per_depth) * certainty);
@@ -180,7 +182,7 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
                 : blend_block<KIND>(frame, sweep.tile, sweep.splats, b, block, wanted, memory, next, evaluated);
         const Vec rgb[3] = {fma(image.T, background[0], image.R), fma(image.T, background[1], image.G),
                             fma(image.T, background[2], image.B)};
-        const Cotangents v = loss_of_block(image, rgb, measured[b], wanted, loss, scales, sums);
+        const Cotangents v = loss_of_block(image, rgb, measured[b], wanted, memory.weights, next.counts[b], loss, scales, sums);
         if (next.counts[b]) {
             if (loss.surface_weight > 0.0f) {
                 TermOfDepth term(measured[b], wanted, loss, scales);
