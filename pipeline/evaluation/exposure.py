@@ -139,7 +139,7 @@ def _squared_errors(
         covered: bool [h, w], pixels that may be fitted.
     """
     color, alpha, image = images
-    grid = _thinned(covered[:, fitted].size)
+    grid = _grid(covered[:, fitted].size)
     used = covered[:, fitted][grid]
     squares = np.empty_like(image[:, :, scored])
     for drawn, seen, error in zip(color, image, squares, strict=True):
@@ -164,7 +164,7 @@ def planes(colors: NDArray[np.floating]) -> Image:
     return np.ascontiguousarray(colors.transpose(2, 0, 1), dtype=np.float32)
 
 
-def _thinned(size: int) -> tuple[slice, slice]:
-    """Rows and columns of a grid of about `MOST_PIXELS` pixels in an image of that many."""
-    stride = max(1, int(np.sqrt(size / MOST_PIXELS)))
+def _grid(pixels: int) -> tuple[slice, slice]:
+    """Rows and columns of about `MOST_PIXELS` pixels, evenly spread in an image of so many."""
+    stride = max(1, int(np.sqrt(pixels / MOST_PIXELS)))
     return np.s_[stride // 2 :: stride, stride // 2 :: stride]

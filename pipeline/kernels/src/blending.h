@@ -186,9 +186,17 @@ ALWAYS_INLINE inline Vec alpha_of(const OpenBlock& image, Mask wanted, SumOfWeig
     const Mask little = wanted & (alpha < Vec(0.5f));
     return any(little) ? select(little, sum_of_weights(), alpha) : alpha;
 }
+// The sum, front to back, of the weights of a block's items: of those that a memory kept, or by blending what was blended once more.
 inline Vec sum_of_kept(const float* weights, uint32_t count) {
     Vec sum(0.0f);
     for (uint32_t k = 0; k < count; k++) sum += load(weights + static_cast<size_t>(k) * LANES);
+    return sum;
+}
+template <DepthKind KIND>
+inline Vec sum_of_blended(const Splat* splats, const TileItems items, uint32_t count, uint32_t unseen, OpenBlock block) {
+    Vec sum(0.0f);
+    uint64_t evaluated = 0;  // counted already
+    blend_candidates<KIND>(splats, items, count, unseen, WeightSum(sum), block, evaluated);
     return sum;
 }
 
