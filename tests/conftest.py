@@ -12,6 +12,7 @@ determinism.configure_determinism()
 # Threads of the kernels sleep while they wait for each other: the images of tests are so small that most of their time
 # would be waiting, and a thread that waits awake counts as processor time.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+os.environ.pop("DUAGC_STORE", None)  # runs of tests keep their results next to them
 
 pytest_plugins = ["tests.budget", "tests.distribution", "tests.fixtures.small_run"]
 
