@@ -34,6 +34,8 @@ CENTRAL = "central"
 """The map trained on all robots' images; it has a section where there is one (`central_map`)."""
 MOST_VIEWS = 40
 """Of a set, unless more are asked for."""
+TRAINING_SHARE = 4
+"""Of so many views that a set may have, keyframes get one: how well a map repeats what it was trained on needs few."""
 APART_PX, MOST_MOMENTS = 1.5, 15
 """Places from which a view is drawn whose camera moved: about as dense as pixels."""
 COMPARED_SETS = ("held_out", "peers", "team")
@@ -128,7 +130,7 @@ def robot_scores(
         threads: views rendered at the same time; changes no bit of the result.
         progress: show it on standard error.
         further: maps besides those of the run: own_longer, in its map frame, and central, in the world.
-        most_views: of a set, evenly spread; of peers' views all peers have the same share.
+        most_views: of a set, evenly spread; of peers' views all peers have the same share, of keyframes a few suffice.
         save: of every set of views, when it is done.
     """
     found: list[Scored] = []
@@ -152,7 +154,7 @@ def robot_scores(
     task = RenderTask(own, robot, "held_out", robot.own_map.depth, most_views)
     score(task, "held_out", f"render maps of {name}")
     mapped = {kind: own[kind] for kind in ("own", "fused")}
-    task = RenderTask(mapped, robot, "keyframes", robot.own_map.depth, most_views)
+    task = RenderTask(mapped, robot, "keyframes", robot.own_map.depth, -(-most_views // TRAINING_SHARE))
     score(task, "training", f"render keyframes of {name}")
     world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in (*COMPARED, CENTRAL)}
     colors = read_peer_colors(robot.folder / "fused.mcap", name)

@@ -53,7 +53,7 @@ PROTOCOL = {
     "feature_agreement": "matched features of the same views, sifted by the images alone; median of medians",
     "initial_relative_poses": "unknown",
     "held_out": "index % 8 == 4",
-    "training": "keyframes",
+    "training": "keyframes, a quarter as many",
     "team": "held-out and peers' views together, of robots that have peers",
     "common": "pixels that own, fused and refined all cover; else what a map does not cover is no part of "
     "its depth error and lowers its completeness",

@@ -173,6 +173,13 @@ def test_few_views_of_a_set_are_scored_if_asked(metrics, tmp_path):
     assert asked["team"] == metrics["team"]
 
 
+def test_few_keyframes_tell_how_well_maps_repeat_them(metrics, tmp_path):
+    fake = make(tmp_path)
+    fused = evaluate(fake.run, fake.recording, progress=False, most_views=5)["rendering"]["fused"]
+    assert fused["held_out"]["views"] == metrics["rendering"]["fused"]["held_out"]["views"]
+    assert fused["training"]["views"] == 2 * 2 < metrics["rendering"]["fused"]["training"]["views"]
+
+
 def test_the_command_scores_as_many_views_as_a_run():
     command = signature(evaluate_command).parameters["views"].default
     assert command == signature(evaluate).parameters["most_views"].default == MOST_VIEWS
