@@ -166,5 +166,5 @@ def planes(colors: NDArray[np.floating]) -> Image:
 
 def _grid(pixels: int) -> tuple[slice, slice]:
     """Rows and columns of about `MOST_PIXELS` pixels, evenly spread in an image of so many."""
-    stride = max(1, int(np.sqrt(pixels / MOST_PIXELS)))
+    stride = max(1, round(float(np.sqrt(pixels / MOST_PIXELS))))
     return np.s_[stride // 2 :: stride, stride // 2 :: stride]

@@ -91,12 +91,14 @@ _STRIP_ROWS = 32  # of windows at a time: what is computed of them stays in the 
 
 @dataclass(frozen=True)
 class _Scale:
-    """One scale of an image that renders are compared with: colors y; means, their squares and variances of windows.
+    """One scale of an image that renders are compared with, and what SSIM needs of it, [H, W, C].
 
-    `weight`: 1 at window positions that count, else 0, [H, W, C]; None: all count.
+    `y`: colors. `twice`: 2 y. `mean`, `mean2`, `variance`: 2 means, squares of means and variances of windows.
+    `weight`: 1 at window positions that count, else 0; None: all count.
     """
 
     y: Image
+    twice: Image
     mean: Image
     mean2: Image
     variance: Image
@@ -115,7 +117,7 @@ class _Scale:
         weight = None
         if mask is not None and not (counted := counted_windows(mask)).all():
             weight = np.where(counted[..., None], np.ones_like(mean), np.float32(0))
-        return _Scale(y, mean, mean2, variance, mask, weight)
+        return _Scale(y, 2 * y, 2 * mean, mean2, variance, mask, weight)
 
     @cached_property
     def count(self) -> int:
@@ -132,7 +134,7 @@ class _Scale:
         for top in range(0, len(self.mean), _STRIP_ROWS):
             rows = slice(top, top + _STRIP_ROWS)
             seen = slice(top, top + _STRIP_ROWS + 2 * _WINDOW_RADIUS)
-            self._strip(x[seen], self.y[seen], rows, images)
+            self._strip(x[seen], self.twice[seen], rows, images)
         means = [self._mean(image) for image in images]
         return means[-1], means[0]
 
@@ -144,7 +146,7 @@ class _Scale:
             raise ValueError("no 11x11 window of SSIM has usable pixels only")
         return float(np.sum(image * self.weight, dtype=np.float64)) / self.count
 
-    def _strip(self, x: Image, y: Image, rows: slice, images: Sequence[Image]) -> None:
+    def _strip(self, x: Image, twice: Image, rows: slice, images: Sequence[Image]) -> None:
         """Contrast-structure term of some rows of windows, from the pixels that they see, and SSIM if it has an image.
 
         (2 cov + C2) / (vx + vy + C2), and this times (2 mx my + C1) / (mx^2 + my^2 + C1).
@@ -155,14 +157,12 @@ class _Scale:
         below -= mx2
         below += self.variance[rows]
         below += _C2
-        above = _window_mean(x * y)
+        above = _window_mean(x * twice)
         above -= mxy
-        above *= 2
         above += _C2
         structure = np.divide(above, below, out=images[0][rows])
         if len(images) == 1:
             return
-        mxy *= 2
         mxy += _C1
         mx2 += self.mean2[rows]
         mx2 += _C1
