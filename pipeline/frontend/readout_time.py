@@ -150,14 +150,14 @@ def _certain(times: Sequence[FoundTime | None], config: ReadoutConfig) -> list[b
     """Whether color and depth are certain to roll; depth only where color seems to roll in its direction.
 
     Depth errs alike over whole walls, which can look like a readout; and a depth camera with a rolling shutter comes
-    with a color camera that has one, while the reverse is common.
+    with a color camera that has one, while the reverse is common: so color is certain where depth is.
     """
     color, depth = times
     if color is None:
         return [False, False]
     if depth is None or color.may_be_chance or color.time_s * depth.time_s < 0:
         return [color.is_certain(config), False]
-    return [color.is_certain(config), depth.is_certain(config)]
+    return [color.is_certain(config) or depth.is_certain(config), depth.is_certain(config)]
 
 
 def _added(

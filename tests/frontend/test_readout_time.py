@@ -94,6 +94,13 @@ def test_a_readout_is_found_by_each_camera(
     assert readout.depth_s == pytest.approx(depth_s, abs=ABOUT_S if depth_s else 0)
 
 
+def test_color_is_made_still_where_depth_is_certain(tmp_path: Path) -> None:
+    short_s = 0.004  # which is left where color alone is read so
+    readout = found(write(tmp_path / "log", CAMERA, images(Readout(short_s, READOUT_S))))
+    assert readout.depth_s == pytest.approx(READOUT_S, abs=ABOUT_S)
+    assert readout.color_s == pytest.approx(short_s, abs=0.003)
+
+
 def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
     logs: dict[str, Path], tmp_path: Path
 ) -> None:
