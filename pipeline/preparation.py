@@ -135,11 +135,14 @@ def with_expected(
         recording: of these robots.
         config: of their front ends.
     """
-    from duagc.pipeline.checks.check import expected_size
 
     def counted(robot: str) -> dict[str, int]:
         size = dict(sizes[robot])
-        return size | (expected_size(recording.log(robot), config) if size["frames"] >= LONG_FRAMES else {})
+        if size["frames"] < LONG_FRAMES:
+            return size
+        from duagc.pipeline.checks.check import expected_size
+
+        return size | expected_size(recording.log(robot), config)
 
     return dict(zip(sizes, in_order(counted, sizes), strict=True))
 

@@ -117,7 +117,7 @@ class _Scale:
         weight = None
         if mask is not None and not (counted := counted_windows(mask)).all():
             weight = np.where(counted[..., None], np.ones_like(mean), np.float32(0))
-        return _Scale(y, 2 * y, 2 * mean, mean2, variance, mask, weight)
+        return _Scale(y, twice=2 * y, mean=2 * mean, mean2=mean2, variance=variance, mask=mask, weight=weight)
 
     @cached_property
     def count(self) -> int:

@@ -95,7 +95,7 @@ class ModelTracker:
 
         Args:
             tracked: not lost.
-            frame: its images.
+            frame: its color; no depth is needed.
             T_map_keyframe: [4, 4], of the keyframe that it is anchored to.
             T_map_view: [4, 4], where the map is drawn; None: where the frame is.
         """

@@ -90,19 +90,20 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
         return Readout()
     rounds = config.rounds if most >= config.move_to_track_again else 1
     pairs = list(view_pairs(log, parts, config.pairs))
-    with _made_still(log, Readout(), parts):
-        first = _estimated(log, pairs, config, ORIENTATIONS)
+
+    def left_of(readout: Readout) -> list[FoundTime | None]:
+        with _made_still(log, readout, parts):
+            return _estimated(log, pairs, config, by_columns=readout.by_columns)
+
     for by_columns in ORIENTATIONS:
-        left = first[by_columns]
+        found = Readout(by_columns=by_columns)
+        left = left_of(found)
         certain = _certain(left, config)
-        if not any(certain):
-            continue
-        found = _added(Readout(by_columns=by_columns), left, certain, longest_s)
-        for _ in range(rounds - 1):
-            with _made_still(log, found, parts):
-                left = _estimated(log, pairs, config, (by_columns,))[by_columns]
+        if any(certain):
             found = _added(found, left, certain, longest_s)
-        return found if _moved(log, found, parts) >= config.least_move else Readout()
+            for _ in range(rounds - 1):
+                found = _added(found, left_of(found), certain, longest_s)
+            return found if _moved(log, found, parts) >= config.least_move else Readout()
     return Readout()
 
 
@@ -175,23 +176,20 @@ def _estimated(
     log: RgbdLog,
     pairs: Sequence[tuple[MovingView, MovingView]],
     config: ReadoutConfig,
-    orientations: Sequence[bool],
-) -> dict[bool, list[FoundTime | None]]:
-    """What is left of the readout of color and of depth, by rows and by columns; None where too few pairs tell."""
-    found: dict[bool, list[list[MotionDifference]]] = {of: [[], []] for of in orientations}
+    *,
+    by_columns: bool,
+) -> list[FoundTime | None]:
+    """What is left of the readout of color and of depth, by rows or by columns; None where too few pairs tell."""
+    found: list[list[MotionDifference]] = [[], []]
     for first, second in pairs:
         seen, other = log.frame(first.index), log.frame(second.index)
         T_start = first.pose_of(second)
         target = RgbdPyramid(pyramid_of(other, log.camera, LEVELS).levels[1:])
-        for by_columns, of_kinds in found.items():
-            halves = [_half(log, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
-            for kind, of_kind in zip(KINDS, of_kinds, strict=True):
-                if (difference := _difference(first, second, halves, target, kind=kind)) is not None:
-                    of_kind.append(difference)
-    return {
-        by_columns: [estimated_time(of_kind, config) for of_kind in of_kinds]
-        for by_columns, of_kinds in found.items()
-    }
+        halves = [_half(log, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
+        for kind, of_kind in zip(KINDS, found, strict=True):
+            if (difference := _difference(first, second, halves, target, kind=kind)) is not None:
+                of_kind.append(difference)
+    return [estimated_time(of_kind, config) for of_kind in found]
 
 
 def _half(

@@ -253,12 +253,13 @@ class RgbdLog:
         for index in range(len(self)):
             yield self.frame(index)
 
-    def frame(self, index: int, *, still: bool = True) -> RgbdFrame:
+    def frame(self, index: int, *, still: bool = True, depth: bool = True) -> RgbdFrame:
         """Read one frame.
 
         Args:
             index: position in the log, 0 <= index < len(self).
             still: put rows that were read one after the other into one time; if not, they are as they were read.
+            depth: with its depth; if not, none is known, nor where the camera was while its shutter was open.
 
         Raises:
             DuagError: an image is damaged; the line names file, topic and time.
@@ -266,7 +267,8 @@ class RgbdLog:
         """
         stamp, depth_stamp = self._stamps(index)
         image = self._decode_color(self._log.record_at(self._color_topic, self._color_at[stamp]))
-        geometry = self._geometry(stamp, depth_stamp, self.readout if still else Readout())
+        readout, shutter = self.readout if still else Readout(), self.shutter if depth else None
+        geometry = self._geometry(stamp, depth_stamp, readout, with_depth=depth)
         mask, found = geometry.mask, geometry.depth
         if geometry.color_unrolling is not None:
             image = geometry.color_unrolling.color(image)
@@ -279,9 +281,7 @@ class RgbdLog:
             depth_offset_ns=self.frame_offset_ns(index),
             depth_sigma=None if found.sigma_m is None else self._of_scene(found.sigma_m),
             depth_moved=geometry.depth_moved,
-            T_camera_moment=None
-            if self.shutter is None
-            else self.shutter.moments(stamp, found.depth_m, self.camera),
+            T_camera_moment=None if shutter is None else shutter.moments(stamp, found.depth_m, self.camera),
         )
 
     def usable_depth(self, index: int) -> NDArray[np.float32]:
@@ -306,22 +306,35 @@ class RgbdLog:
             raise IndexError(f"frame {index} of {len(self)}")
         return self.pairing.pairs[index]
 
-    def _geometry(self, color_ns: int, depth_ns: int | None, readout: Readout) -> _Geometry:
+    def _geometry(
+        self, color_ns: int, depth_ns: int | None, readout: Readout, *, with_depth: bool = True
+    ) -> _Geometry:
         """What a frame has besides its color; readout: by which its rows are put into one time."""
-        mask, read = self._mask_of(color_ns), self._read_depth(depth_ns)
+        mask = self._mask_of(color_ns)
+        read = self._read_depth(depth_ns if with_depth or readout.rolls else None)
         of_color, of_depth = self._unrollings(color_ns, depth_ns, readout, read)
-        depth, moved = read, False
-        if of_depth is not None and of_depth.is_needed:
-            depth, moved = of_depth.depth(DepthImage(self._of_scene(read.depth_m), read.sigma_m)), True
-        if self._motion is not None and depth_ns not in (None, color_ns):
-            T_color_depth = self._motion.between(color_ns, depth_ns)
-            moved = T_color_depth is not None
-            if T_color_depth is not None:
-                seen = DepthImage(self._of_scene(depth.depth_m), depth.sigma_m)
-                depth = move_depth(seen, self.camera, T_color_depth)
+        if with_depth:
+            depth, moved = self._in_time_of_color(read, color_ns, depth_ns, unrolling=of_depth)
+        else:
+            depth, moved = self._read_depth(None), False
         if of_color is None or not of_color.is_needed:
             return _Geometry(depth, moved, mask, mask is not None, None)
         return _Geometry(depth, moved, of_color.usable(mask), mask is not None, of_color)
+
+    def _in_time_of_color(
+        self, read: DepthImage, color_ns: int, depth_ns: int | None, *, unrolling: Unrolling | None
+    ) -> tuple[DepthImage, bool]:
+        """Depth as it would have been read with the middle of its color, and whether it was moved."""
+        depth, moved = read, False
+        if unrolling is not None and unrolling.is_needed:
+            depth, moved = unrolling.depth(DepthImage(self._of_scene(read.depth_m), read.sigma_m)), True
+        if self._motion is None or depth_ns in (None, color_ns):
+            return depth, moved
+        T_color_depth = self._motion.between(color_ns, depth_ns)
+        if T_color_depth is None:
+            return depth, False
+        seen = DepthImage(self._of_scene(depth.depth_m), depth.sigma_m)
+        return move_depth(seen, self.camera, T_color_depth), True
 
     def _read_depth(self, depth_ns: int | None) -> DepthImage:
         if depth_ns is None:

@@ -117,13 +117,16 @@ def _seconds(metadata: Mapping[str, str], key: str, where: str, least_s: float) 
     return seconds
 
 
+@lru_cache(maxsize=4)
 def known_lines(count: int) -> NDArray[np.int64]:
     """Rows, or columns, of an image whose poses are computed.
 
     Args:
         count: that it has.
     """
-    return np.unique(np.r_[np.arange(0, count, LINES_APART), count - 1])
+    lines = np.unique(np.r_[np.arange(0, count, LINES_APART), count - 1])
+    lines.flags.writeable = False
+    return lines
 
 
 def line_times_ns(lines: NDArray[np.int64], count: int, readout_s: float) -> NDArray[np.int64]:
@@ -188,23 +191,30 @@ class Unrolling:
                 by columns [w, 4, 4].
             by_columns: whether columns were read one after the other.
         """
-        camera, u, v = seen.camera, seen.u, seen.v
-        self._camera, self._by_columns = camera, by_columns
+        self._seen, self._camera, self._by_columns = seen, seen.camera, by_columns
         self._T_line_middle = se3.inverse(T_middle_line)
-        found_u, found_v = u, v
+
+    @cached_property
+    def _moved(self) -> Array:
+        """How far [k, l, 2] the seen points are in the rolling image from where they are in the still one."""
+        seen, found_u, found_v = self._seen, self._seen.u, self._seen.v
         for _ in range(ROUNDS):
-            line = np.rint(found_u if by_columns else found_v).astype(np.int64)
+            line = np.rint(found_u if self._by_columns else found_v).astype(np.int64)
             T = self._T_line_middle[np.clip(line, 0, len(self._T_line_middle) - 1)]
             there = np.einsum("...ij,...j->...i", T[..., :3, :3], seen.points) + T[..., :3, 3]
-            found_u, found_v = np.moveaxis(camera.project(there), -1, 0)
-        moved = np.stack([found_u - u, found_v - v], axis=-1)
-        self.move_px = float(np.median(np.hypot(moved[..., 0], moved[..., 1])))
-        self._moved = moved.astype(np.float32)
+            found_u, found_v = np.moveaxis(self._camera.project(there), -1, 0)
+        return np.stack([found_u - seen.u, found_v - seen.v], axis=-1)
+
+    @cached_property
+    def move_px(self) -> float:
+        """How far the median point moves."""
+        return float(np.median(np.hypot(self._moved[..., 0], self._moved[..., 1])))
 
     @cached_property
     def _pixels(self) -> tuple[Image, Image]:
         """Columns and rows [h, w] in the rolling image."""
-        return _interpolated(self._moved, self._camera.height, self._camera.width)
+        moved = self._moved.astype(np.float32)
+        return _interpolated(moved, self._camera.height, self._camera.width)
 
     @property
     def is_needed(self) -> bool:

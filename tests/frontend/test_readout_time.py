@@ -143,6 +143,11 @@ def test_the_front_end_makes_images_still_by_it(logs: dict[str, Path], tmp_path:
         assert log.readout.depth_s == 0
         with open_rgbd(logs["color"]) as as_read:
             assert np.array_equal(log.frame(9, still=False).color, as_read.frame(9).color)
-        seen, rolling = log.frame(9).color[..., 0] / 255.0, read(9, READOUT_S)[0]
+        with_depth, alone = log.frame(9), log.frame(9, depth=False)
+        assert np.array_equal(alone.color, with_depth.color)
+        assert np.array_equal(alone.mask, with_depth.mask)
+        assert with_depth.depth.any()
+        assert not alone.depth.any()
+        seen, rolling = with_depth.color[..., 0] / 255.0, read(9, READOUT_S)[0]
         usable, still = log.frame(9).mask, render(walk(9), camera=CAMERA)[0]
         assert np.abs(seen - still)[usable].mean() < 0.5 * np.abs(rolling - still)[usable].mean()
