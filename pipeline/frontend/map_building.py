@@ -388,10 +388,8 @@ class MapBuilder:
         def registered(frame: TrackedFrame) -> TrackedFrame:
             if frame.frame_index not in T_map_view:
                 return frame
-            color, anchor = (
-                self.log.frame(frame.frame_index, depth=False),
-                T_map_keyframe[frame.keyframe_index],
-            )
+            color = self.log.frame(frame.frame_index, depth=False)
+            anchor = T_map_keyframe[frame.keyframe_index]
             return model.register(frame, color, anchor, T_map_view[frame.frame_index])
 
         return self._checkpoints.each(f"{self.name}.model", frames, registered)
