@@ -60,26 +60,28 @@ def compare_colors(
         sigma_floor_middle: least standard deviation of the middles.
         rounds: of reweighting.
     """
-    middle = [np.median(x, axis=0) for x in (own, other)]
-    spread = [mad_sigmas(x - m) for x, m in zip((own, other), middle, strict=True)]
+    # by channel: numpy sums rows of many numbers twenty times as fast as columns of three
+    sides = [np.ascontiguousarray(colors.T) for colors in (own, other)]
+    middle = [np.median(c, axis=1, keepdims=True) for c in sides]
+    spread = [mad_sigmas(c - m) for c, m in zip(sides, middle, strict=True)]
     squares = [s**2 + _LEAST_SPREAD**2 for s in spread]
     for _ in range(rounds):
         ratio = np.sqrt(squares[1] / squares[0])
-        x, y = own - middle[0], other - middle[1]
+        x, y = (c - m for c, m in zip(sides, middle, strict=True))
         apart = (y - ratio * x) / np.sqrt(ratio)
         sigma = mad_sigmas(apart) + _LEAST_SPREAD
         weight = 1 / (1 + (apart / (_TUNING * sigma)) ** 2) ** 2
-        total = weight.sum(axis=0)
-        middle = [(weight * c).sum(axis=0) / total for c in (own, other)]
-        x, y = own - middle[0], other - middle[1]
-        squares = [(weight * d**2).sum(axis=0) / total + _LEAST_SPREAD**2 for d in (x, y)]
-    correlation = (weight * x * y).sum(axis=0) / total / np.sqrt(squares[0] * squares[1])
+        total = weight.sum(axis=1, keepdims=True)
+        middle = [(weight * c).sum(axis=1, keepdims=True) / total for c in sides]
+        x, y = (c - m for c, m in zip(sides, middle, strict=True))
+        squares = [(weight * d**2).sum(axis=1, keepdims=True) / total + _LEAST_SPREAD**2 for d in (x, y)]
+    correlation = (weight * x * y).sum(axis=1, keepdims=True) / total / np.sqrt(squares[0] * squares[1])
     correlation = np.clip(correlation, _LEAST_CORRELATION, 1.0)
     samples = total / per_sample
-    return ComparedColors(
+    found = (
         0.5 * np.log(squares[1] / squares[0]),
         (1 - correlation**2) / samples + np.log(correlation) ** 2 / 3 + sigma_floor**2,
-        middle[0],
-        middle[1],
+        *middle,
         sigma**2 / samples + sigma_floor_middle**2,
     )
+    return ComparedColors(*(value[:, 0] for value in found))

@@ -41,12 +41,12 @@ def median_in_place(values: NDArray[np.floating]) -> float:
 
 
 def mad_sigmas(deviations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same of every column, [c].
+    """The same of every row, [c, 1].
 
     Args:
-        deviations: [n, c], from the center of each column.
+        deviations: [c, n], from the center of each row.
     """
-    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0))
+    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(deviations), axis=1, keepdims=True))
 
 
 def huber_divisor(

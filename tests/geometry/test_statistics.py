@@ -20,8 +20,7 @@ def test_the_scale_of_a_normal_distribution_is_its_standard_deviation_and_outlie
     assert mad_sigma(draws) == pytest.approx(0.3, rel=0.01)
     draws[:1000] = 1e6
     assert mad_sigma(draws) == pytest.approx(0.3, rel=0.03)
-    columns = np.stack([draws, 2 * draws], axis=1)
-    assert mad_sigmas(columns).tolist() == [mad_sigma(draws), mad_sigma(2 * draws)]
+    assert mad_sigmas(np.stack([draws, 2 * draws])).tolist() == [[mad_sigma(draws)], [mad_sigma(2 * draws)]]
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
