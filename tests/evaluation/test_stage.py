@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 from functools import partial
-from inspect import signature
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -14,11 +13,9 @@ from scipy.spatial import cKDTree
 from duagc.pipeline.base import checkpoints
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.worker_reports import Step
-from duagc.pipeline.cli.runs import evaluate as evaluate_command
 from duagc.pipeline.evaluation import evaluate, robot_measures, trajectory_errors
 from duagc.pipeline.evaluation import views as scored_views
 from duagc.pipeline.evaluation.matching_truth import matching_section
-from duagc.pipeline.evaluation.rendering import MOST_VIEWS
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.evaluation.true_paths import TruePaths
 from duagc.pipeline.experiments.own_longer import own_longer
@@ -159,30 +156,6 @@ def test_a_set_of_views_goes_on_where_it_was_killed(metrics, tmp_path, monkeypat
         if s != "team"
     )
     assert len(counted) + kept == views
-
-
-def test_few_views_of_a_set_are_scored_if_asked(metrics, tmp_path):
-    fake = make(tmp_path)
-    asked = evaluate(fake.run, fake.recording, progress=False, most_views=1)
-    for view_set, views in {"held_out": 2, "peers": 2, "training": 2, "team": 4}.items():
-        assert asked["rendering"]["fused"][view_set]["views"] == views
-    rows = pq.read_table(fake.run / "metrics.parquet").to_pylist()
-    scored = {r["frame_index"] for r in rows if r["view_set"] == "fused/held_out"}
-    assert scored == {12, None}  # of 4, 12 and 20; None: means
-    assert asked["protocol"]["views"] == "at most 1 of a set, evenly spread"
-    assert asked["team"] == metrics["team"]
-
-
-def test_few_keyframes_tell_how_well_maps_repeat_them(metrics, tmp_path):
-    fake = make(tmp_path)
-    fused = evaluate(fake.run, fake.recording, progress=False, most_views=5)["rendering"]["fused"]
-    assert fused["held_out"]["views"] == metrics["rendering"]["fused"]["held_out"]["views"]
-    assert fused["training"]["views"] == 2 * 2 < metrics["rendering"]["fused"]["training"]["views"]
-
-
-def test_the_command_scores_as_many_views_as_a_run():
-    command = signature(evaluate_command).parameters["views"].default
-    assert command == signature(evaluate).parameters["most_views"].default == MOST_VIEWS
 
 
 def test_a_fused_map_shows_what_a_peer_sees(metrics):

@@ -1,0 +1,42 @@
+"""How many views of each set maps are scored at, on a run whose every number is known."""
+
+from inspect import signature
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from duagc.pipeline.cli.runs import evaluate as evaluate_command
+from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.evaluation.rendering import MOST_VIEWS
+from tests.fixtures.fake_run import make
+
+
+@pytest.fixture(scope="module")
+def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    fake = make(tmp_path_factory.mktemp("fake"))
+    return evaluate(fake.run, fake.recording, progress=False)
+
+
+def test_few_views_of_a_set_are_scored_if_asked(metrics: dict, tmp_path: Path) -> None:
+    fake = make(tmp_path)
+    asked = evaluate(fake.run, fake.recording, progress=False, most_views=1)
+    for view_set, views in {"held_out": 2, "peers": 2, "training": 2, "team": 4}.items():
+        assert asked["rendering"]["fused"][view_set]["views"] == views
+    rows = pq.read_table(fake.run / "metrics.parquet").to_pylist()
+    scored = {r["frame_index"] for r in rows if r["view_set"] == "fused/held_out"}
+    assert scored == {12, None}  # of 4, 12 and 20; None: means
+    assert asked["protocol"]["views"] == "at most 1 of a set, evenly spread"
+    assert asked["team"] == metrics["team"]
+
+
+def test_few_keyframes_tell_how_well_maps_repeat_them(metrics: dict, tmp_path: Path) -> None:
+    fake = make(tmp_path)
+    fused = evaluate(fake.run, fake.recording, progress=False, most_views=5)["rendering"]["fused"]
+    assert fused["held_out"]["views"] == metrics["rendering"]["fused"]["held_out"]["views"]
+    assert fused["training"]["views"] == 2 * 2 < metrics["rendering"]["fused"]["training"]["views"]
+
+
+def test_the_command_scores_as_many_views_as_a_run() -> None:
+    command = signature(evaluate_command).parameters["views"].default
+    assert command == signature(evaluate).parameters["most_views"].default == MOST_VIEWS
