@@ -150,7 +150,7 @@ class MappingConfig(Config):
     more than by the keyframes."""
     support_seeds: bool = True
     """Whether supporting frames insert Gaussians where no keyframe saw anything."""
-    densify_rounds: int = 4
+    densify_rounds: int = 2
     """Times, in the first half of the final optimization, that Gaussians that contribute nothing are pruned and the
     room below the cap is seeded where the keyframes are drawn worst; 0: never. The last round fills the cap."""
     rates: LearningRates = LearningRates()

@@ -42,6 +42,8 @@ from duagc.pipeline.splat.optimizer import smoothstep_decay
 
 MANY_VIEWS = 16
 """Views from which on every second one reports what a Gaussian contributes to all."""
+LOSS_VIEWS = 4
+"""Most keyframes, spread over all, at which the loss of a whole map is measured."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class MappingStats:
         pruned: number of Gaussians.
         total: number of Gaussians afterwards.
         loss_before: of the keyframe's own view, at the pixels of its first step.
-        loss_after: of the whole view, after the last one.
+        loss_after: of the same pixels, after the last one.
     """
 
     inserted: int
@@ -216,9 +218,10 @@ class Mapper(MapContent):
             looked_at = sparse.at(step, visits[other.index])
             visits[other.index] += 1
             losses.append(self._optimize(other, level, self.config.rates, looked_at))
-        before = losses[0] if losses else self._loss(view, level)  # the newest keyframe comes first
+        compared = sparse.at(0, 0)
+        before = losses[0] if losses else self._loss(view, level, compared)  # the newest keyframe comes first
         pruned += self._map.prune_transparent()
-        after = self._loss(view, level)
+        after = self._loss(view, level, compared)
         return MappingStats(inserted, pruned, len(self._map), before, after)
 
     def add_view(
@@ -281,20 +284,21 @@ class Mapper(MapContent):
             joint_share: last share of the schedule that is left out, since all tiles are optimized together then.
 
         Returns:
-            Counts of the whole optimization, losses as means over all keyframes at full size.
+            Counts of the whole optimization; losses as means over a few keyframes, at the pixels of a first step.
         """
         config = self.config
         views = [*self._views, *self._support, *self._borders]
         fixed = self._fixed_views(len(views))
         first, found = checkpoints.resume(part) or (0, None)
-        before, inserted, pruned = (self._mean_loss(), *self._cover()) if found is None else found[0]
         _, steps = self.budget.final_steps(len(self._views), len(views), log_s)
+        sparse = SparseSteps(config.sparse, self.cameras[0], steps)
+        compared = sparse.at(0, 0)
+        before, inserted, pruned = (self._mean_loss(compared), *self._cover()) if found is None else found[0]
         alone = alone_steps(steps, joint_share)
         last_prune = min(steps // 2, alone - 1)
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._map.adam.freeze_after(None)
         poses = PoseSteps([view.information for view in views])
-        sparse = SparseSteps(config.sparse, self.cameras[0], steps)
         refined = config.pose_rate > 0 and not self.exact_depth  # where depth is exact, so are the poses
         if found is not None:
             poses.go_on(found[1])
@@ -320,7 +324,7 @@ class Mapper(MapContent):
             state = partial(self._optimized, (before, inserted, pruned), poses)
             checkpoints.at(part, step + 1, steps, state, shown=lambda: self.gaussians)
         pruned += self._map.prune_transparent()
-        return MappingStats(inserted, pruned, len(self._map), before, self._mean_loss())
+        return MappingStats(inserted, pruned, len(self._map), before, self._mean_loss(compared))
 
     def _fixed_views(self, views: int) -> set[int]:
         """Positions of the views whose poses stay: the first of the map, or those of other tiles."""
@@ -338,11 +342,14 @@ class Mapper(MapContent):
 
     # --- one view -----------------------------------------------------------------------------------------------
 
-    def _loss(self, view: View, level: int) -> float:
-        return self._step.loss_of(self._seen(view), self.cameras[level], view.training(level)).value
+    def _loss(self, view: View, level: int, looked_at: LookedAt) -> float:
+        of_view = looked_at.of(view.training(level))
+        return self._step.loss_of(self._seen(view), self.cameras[level], of_view).value
 
-    def _mean_loss(self) -> float:
-        return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
+    def _mean_loss(self, looked_at: LookedAt) -> float:
+        """Over keyframes that are spread over all."""
+        spread = self._views[:: -(-len(self._views) // LOSS_VIEWS) or 1]
+        return float(np.mean([self._loss(view, 0, looked_at) for view in spread])) if spread else 0.0
 
     def _optimize(
         self,
