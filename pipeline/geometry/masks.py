@@ -78,9 +78,10 @@ def checkered(image: NDArray[np.uint8], mask: Mask | None, side_px: int = 8) -> 
     """
     if mask is None:
         return image
-    row, column = (np.arange(size) // side_px for size in mask.shape)
-    board = np.where((row[:, None] + column) % 2 == 0, np.uint8(CHECKER[0]), np.uint8(CHECKER[1]))
-    return np.where(mask[..., None], image, board[..., None])
+    row, column = np.nonzero(~mask)
+    out = image.copy()
+    out[row, column] = np.array(CHECKER, np.uint8)[(row // side_px + column // side_px) % 2, None]
+    return out
 
 
 def filled(color: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
