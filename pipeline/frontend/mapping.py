@@ -32,6 +32,7 @@ from duagc.pipeline.frontend.view_selection import optimization_window
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.kernels import (
     LossWeights,
 )
@@ -284,7 +285,8 @@ class Mapper(MapContent):
             joint_share: last share of the schedule that is left out, since all tiles are optimized together then.
 
         Returns:
-            Counts of the whole optimization; losses as means over a few keyframes, at the pixels of a first step.
+            Counts of the whole optimization; losses as means over a few keyframes, at the pixels of a first step and as
+            if the camera stood still.
         """
         config = self.config
         views = [*self._views, *self._support, *self._borders]
@@ -347,8 +349,9 @@ class Mapper(MapContent):
         return self._step.loss_of(self._seen(view), self.cameras[level], of_view).value
 
     def _mean_loss(self, looked_at: LookedAt) -> float:
-        """Over keyframes that are spread over all."""
-        spread = self._views[:: -(-len(self._views) // LOSS_VIEWS) or 1]
+        """Of a few keyframes, spread over all."""
+        views = self._views
+        spread = [views[k] for k in evenly_spaced(len(views), min(LOSS_VIEWS, len(views)))]
         return float(np.mean([self._loss(view, 0, looked_at) for view in spread])) if spread else 0.0
 
     def _optimize(
