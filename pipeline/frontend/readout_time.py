@@ -74,16 +74,17 @@ class _Half:
 def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutConfig) -> Readout:
     """How long color and depth are read, each if it is certain and long enough to matter; else 0.
 
-    Nothing is looked for where the log states a readout, or has sigma of every depth: such depth is computed from
-    images or sweeps, and its errors look alike in views that are near each other.
+    Nothing is looked for where the log states a readout, and only that of color where it has sigma of every depth: such
+    depth is computed from images or sweeps, and its errors look alike in views that are near each other.
 
     Args:
         log: its images as they were read.
         parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
         config: of the estimate.
     """
-    if not config.enabled or log.states_readout or has_sigma(log):
+    if not config.enabled or log.states_readout:
         return Readout()
+    kinds = KINDS[:1] if has_sigma(log) else KINDS
     longest_s = min(LONGEST_S, _interval_s(log))
     most = max(_moved(log, Readout(longest_s, longest_s, by_columns), parts) for by_columns in ORIENTATIONS)
     if most < config.least_move:
@@ -93,7 +94,7 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
 
     def left_of(readout: Readout) -> list[FoundTime | None]:
         with _made_still(log, readout, parts):
-            return _estimated(log, pairs, config, by_columns=readout.by_columns)
+            return _estimated(log, pairs, config, kinds, by_columns=readout.by_columns)
 
     for by_columns in ORIENTATIONS:
         found = Readout(by_columns=by_columns)
@@ -176,17 +177,21 @@ def _estimated(
     log: RgbdLog,
     pairs: Sequence[tuple[MovingView, MovingView]],
     config: ReadoutConfig,
+    kinds: Sequence[RegistrationConfig],
     *,
     by_columns: bool,
 ) -> list[FoundTime | None]:
-    """What is left of the readout of color and of depth, by rows or by columns; None where too few pairs tell."""
+    """What is left of the readout of color and of depth, by rows or by columns; None where too few pairs tell.
+
+    Depth is not looked at where it is none of the kinds.
+    """
     found: list[list[MotionDifference]] = [[], []]
     for first, second in pairs:
         seen, other = log.frame(first.index), log.frame(second.index)
         T_start = first.pose_of(second)
         target = RgbdPyramid(pyramid_of(other, log.camera, LEVELS).levels[1:])
         halves = [_half(log, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
-        for kind, of_kind in zip(KINDS, found, strict=True):
+        for kind, of_kind in zip(kinds, found, strict=False):
             if (difference := _difference(first, second, halves, target, kind=kind)) is not None:
                 of_kind.append(difference)
     return [estimated_time(of_kind, config) for of_kind in found]

@@ -101,6 +101,14 @@ def test_color_is_made_still_where_depth_is_certain(tmp_path: Path) -> None:
     assert readout.color_s == pytest.approx(short_s, abs=0.003)
 
 
+def test_only_that_of_color_is_looked_for_where_depth_was_computed(tmp_path: Path) -> None:
+    rolling = write(tmp_path / "rolling", CAMERA, images(Readout(READOUT_S, READOUT_S)), with_sigma=True)
+    readout = found(rolling)
+    assert readout.color_s == pytest.approx(READOUT_S, abs=ABOUT_S)
+    assert readout.depth_s == 0
+    assert not found(write(tmp_path / "still", CAMERA, images(Readout()), with_sigma=True)).rolls
+
+
 def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
     logs: dict[str, Path], tmp_path: Path
 ) -> None:
