@@ -21,19 +21,14 @@ from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.shelf import ShelvedList
 from duagc.pipeline.config.exposure import ExposureConfig
+from duagc.pipeline.frontend.color_blocks import ColorBlocks
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
-from duagc.pipeline.geometry import projection, se3
-from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.color_comparison import ComparedColors, compare_colors
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.statistics import evenly_spaced, huber_divisor
-from duagc.pipeline.recording import RgbdFrame
 
-CLIPPED = (2, 253)
-"""Colors of 8 bits beyond are black or saturated: they tell nothing of the gain."""
-SAME_SURFACE = 0.03
-"""Relative difference of depth up to which two frames show the same surface."""
 Pair = tuple[int, int]
 FRAMES_TO_DECIDE = 40
 """Frames between keyframes that are compared before the others, if those differ."""
@@ -41,126 +36,12 @@ MIN_BLOCKS = 100
 """Blocks that two frames must share to be compared."""
 BLOCKS_PER_SAMPLE = 30.0
 """Blocks that say together what one would say alone: neighbors share their errors."""
-SMOOTH = 0.02
-"""Relative standard deviation of the inverse depth in a block up to which it shows one surface."""
-LEAST_WHOLE = 0.7
-"""Share of the blocks that show one surface of which every pixel has a depth; below, holes are scattered over the
-whole image, and pixels without depth are left out."""
-LEAST_KNOWN = 0.5
-"""Share of the pixels of a block that then have a depth."""
-MOST_ROWS = 16_384
-"""Of an image that OpenCV is given: it takes less than 32,767."""
 ROUNDS_OF_PAIR = 8
 """Of reweighting, for the colors of a pair."""
 ROUNDS = 8
 """Of linearization and reweighting, for all frames."""
 HUBER_SIGMAS = 2.0
 """Residuals of pairs beyond count linearly."""
-
-
-@dataclass(frozen=True)
-class ColorBlocks:
-    """A frame as its colors are compared: means over square blocks.
-
-    Attributes:
-        camera: of the blocks.
-        color: float32 [h, w, 3], 0..1; NaN where a pixel of the block is clipped or masked.
-        inverse_depth: float32 [h, w], 1/m; NaN where the block does not show one surface, or is not known.
-    """
-
-    camera: PinholeCamera
-    color: NDArray[np.float32]
-    inverse_depth: NDArray[np.float32]
-
-    @staticmethod
-    def of(frame: RgbdFrame, camera: PinholeCamera, width_px: int) -> ColorBlocks:
-        """Of a whole frame.
-
-        Args:
-            frame: color and depth.
-            camera: of the frame.
-            width_px: about so many columns are left.
-        """
-        import cv2
-
-        side = max(1, round(camera.width / width_px))
-        width, height = camera.width // side, camera.height // side
-        rows, columns = slice(height * side), slice(width * side)
-
-        def mean(image: NDArray[np.float32]) -> NDArray[np.float32]:
-            return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
-
-        taken = frame.color[rows, columns]
-        color = taken * np.float32(1 / 255)
-        color[(taken < CLIPPED[0]) | (taken > CLIPPED[1])] = np.nan
-        scaled = PinholeCamera(
-            width=width,
-            height=height,
-            fx=camera.fx / side,
-            fy=camera.fy / side,
-            cx=(camera.cx + 0.5) / side - 0.5,
-            cy=(camera.cy + 0.5) / side - 0.5,
-        )
-        if frame.mask is not None:
-            color[~frame.mask[rows, columns]] = np.nan
-        return ColorBlocks(scaled, mean(color), _inverse_depth(frame.usable_depth[rows, columns], mean))
-
-    def shared_with(self, other: ColorBlocks, T_self_other: Array) -> tuple[Array, Array]:
-        """Colors [n, 3] of both frames where they show the same surface.
-
-        Args:
-            other: the other frame.
-            T_self_other: [4, 4].
-        """
-        import cv2
-
-        v, u = np.nonzero(np.isfinite(self.inverse_depth) & np.isfinite(self.color).all(axis=2))
-        z = 1 / self.inverse_depth[v, u].astype(np.float64)
-        there = se3.transform(se3.inverse(T_self_other), projection.back_project(self.camera, u, v, z))
-        front = there[:, 2] > projection.NEAR_M
-        u, v, there = u[front], v[front], there[front]
-        if not len(there):
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        at = other.camera.project(there).astype(np.float32)
-        channels = np.concatenate([other.color, other.inverse_depth[..., None]], axis=2)
-        found = np.concatenate(
-            [
-                cv2.remap(
-                    channels,
-                    part[:, :1],
-                    part[:, 1:],
-                    cv2.INTER_LINEAR,
-                    borderMode=cv2.BORDER_CONSTANT,
-                    borderValue=(np.nan,) * 4,
-                ).reshape(-1, 4)
-                for part in np.split(at, range(MOST_ROWS, len(at), MOST_ROWS))
-            ]
-        )
-        with np.errstate(invalid="ignore"):
-            same = np.abs(found[:, 3] * there[:, 2] - 1) < SAME_SURFACE
-        same &= np.isfinite(found).all(axis=1)
-        return self.color[v[same], u[same]].astype(np.float64), found[same, :3].astype(np.float64)
-
-
-def _inverse_depth(
-    depth_m: NDArray[np.float32], mean: Callable[[NDArray[np.float32]], NDArray[np.float32]]
-) -> NDArray[np.float32]:
-    """Inverse depth [h, w] of blocks, 1/m, by means over blocks; where holes are scattered, of the pixels without."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(depth_m > 0, 1 / depth_m, np.float32(np.nan)).astype(np.float32)
-        whole = _smooth(mean(inverse), mean(inverse * inverse))
-        known = mean((depth_m > 0).astype(np.float32))
-        known[known < LEAST_KNOWN] = np.nan
-        inverse[depth_m <= 0] = 0
-        without_holes = _smooth(mean(inverse) / known, mean(inverse * inverse) / known)
-        scattered = np.count_nonzero(whole > 0) < LEAST_WHOLE * np.count_nonzero(without_holes > 0)
-    return without_holes if scattered else whole
-
-
-def _smooth(mean: NDArray[np.float32], mean_square: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means of inverse depth over blocks; NaN where a block does not show one surface."""
-    same = mean_square - mean * mean <= (SMOOTH * mean) ** 2
-    return np.where(same, mean, np.float32(np.nan))
 
 
 @dataclass(frozen=True)
@@ -180,18 +61,16 @@ class ComparedPair:
 
 @dataclass(frozen=True)
 class ExposureEstimation:
-    """Where frames are read and how they are compared.
+    """What frames show, and how they are compared.
 
     Attributes:
-        read: a frame of the log, by its index.
-        camera: of all frames.
+        blocks: of a frame of the log, by its index; asked for once.
         config: settings.
         checkpoints: of the stage.
         part: its name there.
     """
 
-    read: Callable[[int], RgbdFrame]
-    camera: PinholeCamera
+    blocks: Callable[[int], ColorBlocks]
     config: ExposureConfig
     checkpoints: Checkpoints = NO_CHECKPOINTS
     part: str = "exposures"
@@ -215,7 +94,7 @@ class ExposureEstimation:
         """
         if self.config.mode == "off":
             return ExposureTrack()
-        blocks = ShelvedList(map(self._blocks, keyframes))
+        blocks = ShelvedList(map(self.blocks, keyframes))
 
         def of_pair(pair: Pair) -> list[ComparedPair]:
             i, j = pair
@@ -232,9 +111,6 @@ class ExposureEstimation:
         others = [frame for k, frame in enumerate(usable) if k not in first]
         return solve_exposures([*compared, *self._compared("frames", others, keyframes, blocks)], self.config)
 
-    def _blocks(self, frame_index: int) -> ColorBlocks:
-        return ColorBlocks.of(self.read(frame_index), self.camera, self.config.width_px)
-
     def _compared(
         self,
         which: str,
@@ -245,7 +121,7 @@ class ExposureEstimation:
         """Frames compared with their keyframes."""
 
         def of_frame(frame: TrackedFrame) -> list[ComparedPair]:
-            k, own = frame.keyframe_index, self._blocks(frame.frame_index)
+            k, own = frame.keyframe_index, self.blocks(frame.frame_index)
             ends = (keyframes[k], blocks[k]), (frame.frame_index, own)
             return compare(*ends, frame.T_keyframe_camera, self.config)
 

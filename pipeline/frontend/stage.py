@@ -7,9 +7,8 @@ The stage is offline in this sense; times in the log are those of the recording 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import SupportsIndex
 
@@ -25,6 +24,7 @@ from duagc.pipeline.base.worker_reports import KEYFRAMES
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.frontend.color_blocks import BlocksOfLog
 from duagc.pipeline.frontend.component_paths import ComponentPath, images_of, optimized_paths, trajectories_of
 from duagc.pipeline.frontend.depth_delay import certain_delay_ns
 from duagc.pipeline.frontend.depth_quality import depth_noise_m, largest_depth_offset_s, median_depth_m
@@ -53,7 +53,7 @@ from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.view_poses import moved_factors
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.messages import Keyframe
-from duagc.pipeline.recording import MotionPrior, RgbdLog, open_rgbd
+from duagc.pipeline.recording import MotionPrior, RgbdFrame, RgbdLog, open_rgbd
 from duagc.pipeline.recording.moved_depth import DELAY_KEY
 from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.pipeline.recording.shutter import FOUND_KEY
@@ -99,7 +99,9 @@ def run_frontend(
         )
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
-        tracked = _Tracking(log, config, motion, save, seed=seed, threads=threads, progress=progress).run()
+        blocks = BlocksOfLog(log, config.exposure.width_px)
+        tracking = _Tracking(log, config, motion, save, blocks, seed=seed, threads=threads, progress=progress)
+        tracked = tracking.run()
         if not tracked.submaps[0].keyframes:
             reasons = ", ".join(sorted({frame.reason.value for frame in tracked.frames}))
             size = f"{log.camera.width} x {log.camera.height}"
@@ -130,6 +132,7 @@ def run_frontend(
                 depth=depth,
                 clock=clock,
                 checkpoints=save,
+                blocks=blocks,
             )
             stage.run(paths[at], out_path if name == log.robot else component_path(out_path, name))
     return clock.laps
@@ -172,6 +175,7 @@ class _Tracking:
     config: FrontendConfig
     motion: MotionPrior | None
     checkpoints: Checkpoints
+    blocks: BlocksOfLog
     seed: int
     threads: SupportsIndex
     progress: bool
@@ -179,7 +183,8 @@ class _Tracking:
     def run(self) -> TrackedLog:
         """Track; where depth is of other times, or rows move far, again with them moved by the first result."""
         log, save = self.log, self.checkpoints
-        first = save.done("tracked first", lambda: self._frames("tracking"))
+        keep = self.blocks.keep if self.config.exposure.mode != "off" else None
+        first = save.done("tracked first", lambda: self._frames("tracking", keep))
         if delay_ns := save.done("delay", lambda: self._delay_ns(first)):
             save.say(
                 f"depth of {log.robot} was taken {1e-6 * delay_ns:.1f} ms before its stamps, and is moved"
@@ -217,7 +222,7 @@ class _Tracking:
         late = bool(log.pairing.largest_offset_ns)
         return self._frames("tracking again") if late or moves_rows_far(log, self.config.readout) else tracked
 
-    def _frames(self, part: str) -> TrackedLog:
+    def _frames(self, part: str, keep: Callable[[RgbdFrame], None] | None = None) -> TrackedLog:
         log, save = self.log, self.checkpoints
         tracker = self._tracker()
         begin = 0
@@ -228,7 +233,10 @@ class _Tracking:
         if self.progress:
             left = progress_bar.track(left, f"{part} {log.robot}", len(log) - begin)
         for index in left:
-            tracker.track(RgbdImages.of(log.frame(index)))
+            frame = log.frame(index)
+            if keep is not None:
+                keep(frame)
+            tracker.track(RgbdImages.of(frame))
             save.at(part, index + 1, len(log), tracker.state, shown=tracker.path)
         return tracker.finish()
 
@@ -264,6 +272,7 @@ class _ComponentStage:
         depth: of the Gaussians, as it is drawn.
         clock: of the stage.
         checkpoints: of the stage.
+        blocks: of its frames.
     """
 
     log: RgbdLog
@@ -276,6 +285,7 @@ class _ComponentStage:
     depth: DepthKind
     clock: LapTimes
     checkpoints: Checkpoints
+    blocks: BlocksOfLog
 
     def run(self, path: ComponentPath, out_path: Path) -> None:
         """Map, and write the log.
@@ -301,8 +311,7 @@ class _ComponentStage:
             log.move_depth(tracked_path(frames, solution.T_map_keyframe))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
         part = f"{self.name}.exposures"
-        read = partial(log.frame, still=False)  # blocks of colors are larger than what rows move by
-        estimation = ExposureEstimation(read, log.camera, self.config.exposure, save, part)
+        estimation = ExposureEstimation(self.blocks.of, self.config.exposure, save, part)
         exposures = save.done(
             part,
             lambda: estimation.run(
@@ -312,6 +321,7 @@ class _ComponentStage:
                 frames,
             ),
         )
+        self.blocks.forget(frame.frame_index for frame in frames)
         clock.lap("refinement_s")
         built = self._map(keyframes, frames, exposures)
         refined = replace(solution, T_map_keyframe=built.T_map_keyframe)

@@ -14,7 +14,8 @@ from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, Track
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.evaluation.image_metrics import psnr
-from duagc.pipeline.frontend.exposure import ColorBlocks, ExposureEstimation
+from duagc.pipeline.frontend.color_blocks import ColorBlocks
+from duagc.pipeline.frontend.exposure import ExposureEstimation
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
@@ -68,9 +69,8 @@ def estimated(frames: list[RgbdFrame], config: ExposureConfig = CONFIG) -> Expos
         )
     poses, last = np.array([pose(k) for k in keyframes]), range(1, len(keyframes))
     pairs = [(k - 1, k) for k in last] + [(0, k) for k in last]
-    return ExposureEstimation(lambda index: frames[index], CAMERA, config).run(
-        keyframes, poses, pairs, tracked
-    )
+    blocks = [ColorBlocks.of(f, CAMERA, config.width_px) for f in frames]
+    return ExposureEstimation(blocks.__getitem__, config).run(keyframes, poses, pairs, tracked)
 
 
 def wandering(count: int) -> np.ndarray:
