@@ -6,7 +6,7 @@ values with that reason.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation.oracle import NO_MATCHES, gap_to_oracle, matches_among
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
-from duagc.pipeline.recording import read_log
+from duagc.pipeline.recording import Record, read_log
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.schemas import topics
 
@@ -131,15 +131,16 @@ class Session:
     def __init__(self, run: RunFolder) -> None:
         self.run = run
 
-    def _log(self, name: str, topic: topics.Topic) -> list[Any]:
-        """The messages of all robots on one topic, in order of the log."""
+    def _records(self, name: str, *of: topics.Topic) -> Iterator[Record]:
+        """The records of all robots on some topics, in order of the log."""
         path = self.run.path / name
         if not path.is_file():
             raise DuagError(f"{path}: not found, expected the log of the exchange")
-        return [
-            record.message()
-            for record in read_log(path, topics=[topic.of(robot) for robot in self.run.robots])
-        ]
+        return read_log(path, topics=[topic.of(robot) for topic in of for robot in self.run.robots])
+
+    def _log(self, name: str, topic: topics.Topic) -> list[Any]:
+        """The messages of all robots on one topic, in order of the log."""
+        return [record.message() for record in self._records(name, topic)]
 
     @cached_property
     def packets(self) -> Packets:
@@ -148,9 +149,16 @@ class Session:
         Raises:
             DuagError: a packet refers to a message that the log does not have, or to an unknown kind.
         """
-        kinds = {(m.robot, m.message): m.kind_name for m in self._log("exchange.mcap", topics.PEER_MESSAGE)}
+        of_messages = {topics.PEER_MESSAGE.of(robot) for robot in self.run.robots}
+        kinds, packets = {}, []
+        for record in self._records("exchange.mcap", topics.PEER_MESSAGE, topics.PEER_PACKET):
+            m = record.message()
+            if record.topic in of_messages:
+                kinds[m.robot, m.message] = m.kind_name
+            else:
+                packets.append(m)
         rows, used = [], set()
-        for p in self._log("exchange.mcap", topics.PEER_PACKET):
+        for p in packets:
             if same_robot(p.robot, p.receiver):
                 continue  # no radio carried it
             kind = kinds.get((p.robot, p.message))
