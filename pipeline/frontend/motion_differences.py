@@ -151,12 +151,12 @@ def joint_information(first: Array, second: Array) -> Array:
 
 
 def change(T_first_second: Array, first: Array, second: Array) -> Array:
-    """Change [6] of a velocity from one view to another, right tangent of the second.
+    """Change [..., 6] of a velocity from one view to another, right tangent of the second.
 
     Args:
-        T_first_second: [4, 4].
+        T_first_second: [..., 4, 4].
         first: [6], velocity of the first view.
-        second: [6], that of the second.
+        second: [..., 6], that of the second.
     """
     return np.asarray(second - se3.adjoint(se3.inverse(T_first_second)) @ first)
 
@@ -195,16 +195,15 @@ def _changed(
     first: MovingView, views: Sequence[MovingView], focal_px: float, reach_px: float
 ) -> MovingView | None:
     """The view next to one, in time and place, in which the camera moves most differently; None if there is none."""
+    near = [v for v in views if v is not first and abs(v.stamp_ns - first.stamp_ns) <= FARTHEST_NS]
+    if not near:
+        return None
     px = focal_px * np.array([*[1 / TYPICAL_DEPTH_M] * 3, 1.0, 1.0, 1.0])
-    best, most = None, 0.0
-    for second in views:
-        if second is first or abs(second.stamp_ns - first.stamp_ns) > FARTHEST_NS:
-            continue
-        T = first.pose_of(second)
-        changed = float(np.linalg.norm(px * change(T, first.velocity, second.velocity)))
-        if changed > most and np.linalg.norm(px * se3.log(T)) <= reach_px:
-            best, most = second, changed
-    return best
+    T = se3.inverse(first.T_map_camera) @ np.array([view.T_map_camera for view in near])
+    velocities = np.array([view.velocity for view in near])
+    changed = np.linalg.norm(px * change(T, first.velocity, velocities), axis=1)
+    reached = (changed > 0) & (np.linalg.norm(px * se3.log(T), axis=1) <= reach_px)
+    return near[int(np.argmax(np.where(reached, changed, 0.0)))] if reached.any() else None
 
 
 def _solve(found: Sequence[MotionDifference], config: MotionTimeConfig) -> tuple[float, float]:
