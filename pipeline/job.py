@@ -23,8 +23,9 @@ from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.chain import Chain, Prepared
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.preparation import FusionPool, RobotProcesses, Say, with_expected, workers_that_fit
+from duagc.pipeline.preparation import Say, with_expected, workers_that_fit
 from duagc.pipeline.recording import Recording
+from duagc.pipeline.robot_processes import FusionProcesses, RobotProcesses
 from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import digest_file
@@ -208,13 +209,13 @@ class Job:
 
     def _starting_fusion(
         self, prepared: dict[str, Prepared], computed: bool
-    ) -> AbstractContextManager[FusionPool | None]:
+    ) -> AbstractContextManager[FusionProcesses | None]:
         """The processes of the fusion, which start next to an exchange that is computed; None: there are none."""
         if not computed or not self.plan.has(stages.FUSION):
             return nullcontext(None)
         sizes, quiet = list(self._sizes(prepared).values()), replace(self.carrier, say=lambda line: None)
         workers = workers_that_fit(sizes, quiet, self.plan.workers, share=FUSION_SHARE)  # said when it begins
-        return self._processes().starting_fusion(len(prepared), workers) if workers > 1 else nullcontext(None)
+        return self._processes().starting_fusion([*prepared], workers) if workers > 1 else nullcontext(None)
 
     def _shown(
         self, chain: Chain, done: list[Carried], notes: dict[str, str], workers: Callable[[], int]
@@ -267,7 +268,7 @@ class Job:
             raise
 
     def _fused(
-        self, chain: Chain, prepared: dict[str, Prepared], exchange: Carried, ready: FusionPool | None
+        self, chain: Chain, prepared: dict[str, Prepared], exchange: Carried, ready: FusionProcesses | None
     ) -> list[Carried]:
         """The fused map of every robot; `workers` at a time in processes of their own, which may be ready."""
         looking = self._looking()

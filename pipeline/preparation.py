@@ -1,31 +1,21 @@
-"""Stages of robots that have no results yet, in processes of their own, as many as fit into memory."""
+"""What a run knows before its stages begin: what carries them out, and how many robots fit into memory."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from importlib import import_module
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from duagc.pipeline import steps, watch
-from duagc.pipeline.base import worker_reports
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.machine import memory_bytes
-from duagc.pipeline.base.thread_share import SharedThreads, ThreadShare, keep_share
-from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.cache.carrier import Carried, Carrier
+from duagc.pipeline.cache.carrier import Carrier
 from duagc.pipeline.cache.code_identity import CodeVersion
-from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.footprint import fitting, robot_bytes
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store
-from duagc.pipeline.chain import Chain, Prepared
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.recording import Recording
@@ -33,7 +23,6 @@ from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
 
 MEASURED = 20  # results of front ends that memory is estimated from
-FUSION = "duagc.pipeline.fusion.stage"
 LONG_FRAMES = 1000  # a shorter log is tracked, and its keyframes are counted, within seconds
 Say = Callable[[str], None]
 
@@ -185,190 +174,3 @@ def workers_that_fit(
             f"found {free / 1e9:.1f} GB free"
         )
     return workers
-
-
-@dataclass(frozen=True)
-class FusionPool:
-    """Processes that wait for the fusion of robots.
-
-    Attributes:
-        pool: of them.
-        share: of the machine's threads.
-        robots: that they are for.
-        workers: how many they are.
-    """
-
-    pool: ProcessPoolExecutor
-    share: ThreadShare
-    robots: int
-    workers: int
-
-
-@dataclass(frozen=True)
-class RobotProcesses:
-    """Stages of robots, each robot by one of some processes.
-
-    Attributes:
-        recording: that the run is of.
-        folder: of the run.
-        config: settings of all stages.
-        plan: how it is done.
-        place: where an earlier run may be.
-        where: of the server that shows the run; None: nobody follows.
-        versions: of the code of the stages, by entry, as the run began with them.
-    """
-
-    recording: Path
-    folder: Path
-    config: RunConfig
-    plan: RunPlan
-    place: Path
-    where: Any = None
-    versions: Mapping[str, CodeVersion] = field(default_factory=dict)
-
-    def prepare(
-        self,
-        robots: Sequence[str],
-        workers: int,
-        *,
-        alone: bool,
-        hear: worker_reports.Hear,
-        meanwhile: Callable[[], None] = lambda: None,
-    ) -> dict[str, Prepared]:
-        """Front end and information of robots; by name of the component.
-
-        Args:
-            robots: their names.
-            workers: how many at the same time.
-            alone: leave the information out.
-            hear: gets steps of front ends, in another thread.
-            meanwhile: is done here while the processes start.
-        """
-        found, share = dict[str, Prepared](), ThreadShare(workers, len(robots))
-        with (
-            worker_reports.listening(hear) as queue,
-            worker_pool(workers, _keep, (queue, *share.handed)) as pool,
-        ):
-            tasks = [pool.submit(self.prepare_one, robot, alone=alone) for robot in robots]
-            for task in tasks:
-                task.add_done_callback(share.done)
-            meanwhile()
-            for task in tasks:
-                found |= task.result()
-        return found
-
-    def prepare_one(self, robot: str, *, alone: bool) -> dict[str, Prepared]:
-        """Front end and information of one robot, in a process of its own.
-
-        Args:
-            robot: its name.
-            alone: leave the information out.
-        """
-        heard = watch.in_worker(self.where)
-        try:
-            return self._chain(heard).robot(robot, threads=SharedThreads(), alone=alone)
-        finally:
-            heard.tell((robot, "", 0, 0))
-            if heard.follower is not None:
-                heard.follower.close()
-
-    @contextmanager
-    def starting_fusion(self, robots: int, workers: int) -> Iterator[FusionPool]:
-        """Processes for fused maps, which start and import what they need while this one does something else.
-
-        Args:
-            robots: how many.
-            workers: how many at the same time.
-        """
-        share = ThreadShare(workers, robots)
-        with worker_pool(workers, keep_share, share.handed) as pool:
-            for _ in range(workers):
-                pool.submit(import_module, FUSION)
-            yield FusionPool(pool, share, robots, workers)
-
-    def fuse(
-        self,
-        robots: Mapping[str, Prepared],
-        exchange: Carried,
-        workers: int,
-        ready: FusionPool | None = None,
-    ) -> dict[str, Carried]:
-        """The fused maps of robots, by name.
-
-        Args:
-            robots: with their own results, by name.
-            exchange: of the team.
-            workers: how many at the same time.
-            ready: processes that wait for it; used if they are as many.
-        """
-        if ready is None or (ready.robots, ready.workers) != (len(robots), workers):
-            with self.starting_fusion(len(robots), workers) as started:
-                return self.fuse(robots, exchange, workers, started)
-        tasks = {
-            name: ready.pool.submit(self.fuse_one, name, robot, exchange) for name, robot in robots.items()
-        }
-        for task in tasks.values():
-            task.add_done_callback(ready.share.done)
-        return {name: task.result() for name, task in tasks.items()}
-
-    def fuse_one(self, name: str, robot: Prepared, exchange: Carried) -> Carried:
-        """The fused map of one robot, in a process of its own.
-
-        Args:
-            name: of the robot.
-            robot: with its own results.
-            exchange: of the team.
-        """
-        return self._chain(watch.UNWATCHED).fusion(name, robot, exchange, threads=SharedThreads())
-
-    @contextmanager
-    def matching(self, logs: Mapping[str, Path]) -> Iterator[Callable[[], dict[str, Any]]]:
-        """While a process does what the evaluation can do already; what to call for it, by robot.
-
-        Args:
-            logs: of the robots' sensors, by name of the component.
-        """
-        with worker_pool(1) as pool:
-            tasks = {
-                name: pool.submit(steps.matched_views, name, log, self.folder) for name, log in logs.items()
-            }
-            pool.shutdown(wait=False)  # the process ends when it is done
-            yield lambda: {name: task.result() for name, task in tasks.items()}
-
-    @contextmanager
-    def viewing(self, done: Sequence[Carried], more: Mapping[str, str]) -> Iterator[Future[Carried]]:
-        """While the run is written as Rerun shows it, in a process of its own.
-
-        Args:
-            done: as of `Chain.reader`.
-            more: as of `Chain.reader`.
-        """
-        with worker_pool(1) as pool:
-            yield pool.submit(self.view, done, more)
-
-    def view(self, done: Sequence[Carried], more: Mapping[str, str]) -> Carried:
-        """The run as Rerun shows it.
-
-        Args:
-            done: as of `Chain.reader`.
-            more: as of `Chain.reader`.
-        """
-        return self._chain(watch.UNWATCHED).reader(stages.VIEW, done, more, lambda: 1)
-
-    def _chain(self, heard: watch.Watch) -> Chain:
-        """The stages, in a process that knows nothing of the run yet."""
-
-        def log(line: str) -> None:
-            say(f"duagc: {line}")
-
-        carrier = carrier_of(self.folder, self.config, self.plan, log=log, place=self.place)
-        digests = FileDigests(None) if carrier.store is None else carrier.store.files
-        if carrier.store is not None:
-            carrier.store.code.adopt(dict(self.versions))
-        return Chain(Recording(self.recording), carrier, digests, heard)
-
-
-def _keep(queue: Any, busy: Any, in_all: int) -> None:
-    """What a worker process keeps: where it reports its steps, and its share of the threads."""
-    worker_reports.keep_queue(queue)
-    keep_share(busy, in_all)

@@ -215,6 +215,23 @@ def fusion(
     return {"left_out": left_out, "robots": len(result.component)}
 
 
+def read_ahead(robot: str, log: Path, folder: Path, config: RunConfig) -> None:
+    """Read what the fusion of a robot needs, while the robots meet; this process keeps it.
+
+    Args:
+        robot: its name.
+        log: of its sensors.
+        folder: of its own results.
+        config: of the run.
+    """
+    from duagc.pipeline.base.workers import when_idle
+    from duagc.pipeline.fusion.own_images import read_ahead
+
+    determinism.configure_opencv()
+    source = agent_input(robot, log, folder, config)
+    when_idle(lambda: read_ahead(source, config.fusion.finetune))
+
+
 def fuse_robot(
     robot: str,
     log: Path,

@@ -171,17 +171,24 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
     (
         _part(
             "preparation",
-            "robots in processes",
-            "base config runs recording checks cache steps watch chain run_plan",
+            "what a run knows first",
+            "base config runs recording checks cache run_plan",
         ),
     ),
-    (_part("manifest", "what a run says about itself", "cache runs preparation"),),
+    (
+        _part(
+            "robot_processes",
+            "robots in processes",
+            "base config runs recording cache steps watch chain run_plan preparation",
+        ),
+        _part("manifest", "what a run says about itself", "cache runs preparation"),
+    ),
     (
         _part(
             "job",
             "a run that is made",
             "base config runs recording evaluation viewing checks cache steps watch time_left chain preparation",
-            "run_plan manifest",
+            "robot_processes run_plan manifest",
         ),
     ),
     (

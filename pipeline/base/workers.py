@@ -8,6 +8,7 @@ import os
 import pickle
 import resource
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -18,6 +19,8 @@ from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
 
+LEAST_PRIORITY = 19
+"""Nice value of what waits for all others."""
 _handed_down: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
 
 
@@ -107,6 +110,31 @@ def end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+def when_idle(do: Callable[[], None]) -> None:
+    """Do something in the time that others leave of the processors; as anything else where that cannot be asked for.
+
+    Args:
+        do: what to do; its errors are raised here.
+    """
+    failed: list[BaseException] = []
+
+    def in_thread() -> None:
+        if (
+            sys.platform == "linux"
+        ):  # where threads have priorities of their own, which cannot be raised again
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LEAST_PRIORITY)
+        try:
+            do()
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=in_thread)
+    thread.start()
+    thread.join()
+    if failed:
+        raise failed[0]
 
 
 def peak_memory_bytes() -> int:

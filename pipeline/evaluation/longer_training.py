@@ -10,7 +10,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.finetune import num_steps
-from duagc.pipeline.fusion.stage import training_views
+from duagc.pipeline.fusion.own_images import training_images
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.recording import Recording, open_rgbd
@@ -76,5 +76,5 @@ def images_of(run: RunFolder, robot: RobotRun, source: Recording, poses: Array) 
     num_support = config.at_most(config.support_views, len(robot.keyframes))
     T_map_keyframe, own = np.array([k.T_map_camera for k in robot.keyframes]), robot.own_map
     seen_m = blur_distance_m(own.gaussians, T_map_keyframe, own.depth)
-    moving = run.config.frontend.moving
-    return training_views(files, frames, poses, num_support=num_support, seen_m=seen_m, moving=moving)
+    images = training_images(files, frames, num_support=num_support, seen_m=seen_m)
+    return images.views(poses, run.config.frontend.moving)

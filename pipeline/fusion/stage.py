@@ -10,9 +10,7 @@ from typing import SupportsIndex
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import Checkpoints
-from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.shelf import SHELF, ShelvedList
 from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
@@ -25,6 +23,7 @@ from duagc.pipeline.fusion.finetune import finetune_map
 from duagc.pipeline.fusion.fuse import FusedMap, OwnMap, fuse
 from duagc.pipeline.fusion.most_drawn import most_drawn
 from duagc.pipeline.fusion.opacity_update import update_opacities
+from duagc.pipeline.fusion.own_images import take_read_ahead
 from duagc.pipeline.fusion.peer_validation import PeerCheck, ValidatedPeers, validate_peer_maps
 from duagc.pipeline.fusion.peer_views import peer_views
 from duagc.pipeline.fusion.stated_scale import stated_scale
@@ -36,17 +35,14 @@ from duagc.pipeline.messages import (
     WORLD_FRAME,
     CorrectedKeyframes,
     GaussianMap,
-    Odometry,
     PeerColors,
     PeerMapReport,
     RejectedMatches,
 )
-from duagc.pipeline.recording import LogWriter, open_rgbd, read_exposures, read_log
-from duagc.pipeline.registration.moving import FreeSpace
-from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
+from duagc.pipeline.recording import LogWriter
+from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.ply import write_ply
-from duagc.pipeline.splat.training_frames import blur_distance_m, training_frames
 from duagc.schemas import topics
 
 
@@ -98,19 +94,15 @@ def run_fusion(
     Raises:
         DuagError: a file lacks what it should hold, or two files do not belong together.
     """
-    own = SHELF.put(load(source))
-    frames = _placed_frames(source)
+    read = take_read_ahead(source, config.finetune)
+    own, frames = read.own, read.frames
     T_world_camera = np.array(
         [result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames]
     )
     context = MapContext(own.camera, config, matching, own.depth, weights, threads, seed=seed)
     views: Sequence[PosedRgbd] = []
     if len(result.component) > 1:
-        num_support = config.finetune.at_most(config.finetune.support_views, own.keyframes)
-        seen_m = blur_distance_m(own.gaussians, own.T_map_keyframe, own.depth)
-        views = training_views(
-            source, frames, T_world_camera, num_support=num_support, seen_m=seen_m, moving=moving
-        )
+        views = read.images().views(T_world_camera, moving)
     fusion = _fuse(own, result, views, context, save=checkpoints or Checkpoints())
     SHELF.sweep(heap=True)
     refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
@@ -253,64 +245,9 @@ def _finetuned(
     return start, refined
 
 
-def training_views(
-    source: AgentInput,
-    frames: Sequence[Odometry],
-    T_world_camera: Array,
-    *,
-    num_support: int,
-    seen_m: float | None,
-    moving: MovingConfig,
-) -> Sequence[PosedRgbd]:
-    """The robot's keyframes and, of equal parts of its path, a frame between them; none held out.
-
-    Args:
-        source: the robot's own files.
-        frames: that have a pose, in order.
-        T_world_camera: [n, 4, 4], these poses, in the frame of the views.
-        num_support: most frames between keyframes.
-        seen_m: of `training_frames`, which takes the others.
-        moving: as the front end looked for what moves.
-    """
-    topic = topics.KEYFRAME.of(source.robot)
-    keyframes = {record.message().frame_index for record in read_log(source.frontend, (topic,))}
-    first = [k for k, f in enumerate(frames) if f.frame_index in keyframes]
-    others = [k for k, f in enumerate(frames) if f.frame_index not in keyframes and not f.held_out]
-    count = min(num_support, len(others))
-    stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
-    path = Trajectory(stamps, np.array([frame.T_map_camera for frame in frames]))
-    between = training_frames(path, others, count, seen_m)
-    exposures = read_exposures(source.frontend, source.robot)
-    with open_rgbd(source.log) as log:
-        log.move_depth_by(source.frontend, path)
-        free = FreeSpace(log.camera, moving)
-
-        def posed(k: int) -> PosedRgbd:
-            frame, T = log.frame(frames[k].frame_index), T_world_camera[k]
-            usable = frame.usable_depth
-            if frames[k].frame_index in keyframes:
-                free.add(usable, T)
-            exposure = exposures.at(frame.index)
-            found = PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure)
-            return replace(found, T_camera_moment=frame.T_camera_moment)
-
-        views = ShelvedList(map(posed, (*first, *between)))
-    return ShelvedList(replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views)
-
-
 def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:
     for keyframe in range(own.keyframes):
         yield keyframe, own.images(keyframe).depth_m
-
-
-def _placed_frames(source: AgentInput) -> list[Odometry]:
-    """Every frame that the front end gave a pose, in order."""
-    topic = topics.ODOMETRY.of(source.robot)
-    frames = [record.message() for record in read_log(source.frontend, (topic,))]
-    placed = [f for f in frames if f.status != "lost"]
-    if not placed:
-        raise DuagError(f"{source.frontend}: {topic} has no tracked frame")
-    return placed
 
 
 def _write_log(path: Path, result: SessionResult, fusion: _Fusion, *, stamp_ns: int, own: RobotData) -> None:

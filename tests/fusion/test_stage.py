@@ -14,6 +14,8 @@ from duagc.pipeline.config.consensus import ColorConfig, MapMatching
 from duagc.pipeline.config.fusion import FinetuneConfig, FusionConfig, StatedScaleConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.fusion import own_images
+from duagc.pipeline.fusion.own_images import read_ahead
 from duagc.pipeline.fusion.stage import run_fusion
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -254,6 +256,26 @@ def test_a_neighbor_far_from_own_images_raises_what_is_stated_of_positions(robot
     for name in ("color", "opacity", "ids"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     np.testing.assert_array_equal(maps[1].gaussians.means, maps[0].gaussians.means)
+
+
+def test_what_was_read_ahead_is_read_once_and_gives_the_same_bytes(robot, tmp_path, monkeypatch):
+    source = AgentInput("bravo", robot.log, robot.frontend, robot.information, 1e-3)
+    moved = np.array([se3.exp(np.array([1.0, 0, 0, 0, 0, 0.3]))]) @ robot.T_map_keyframe
+    other = Evidence("alpha", np.array([40]), np.zeros(1), np.zeros((1, 13)), np.ones((1, 31)))
+    loads: list[AgentInput] = []
+    load = own_images.load
+    monkeypatch.setattr(own_images, "load", lambda files: loads.append(files) or load(files))
+    files = []
+    for ahead in (False, True, False):
+        folder = tmp_path / str(len(files))
+        folder.mkdir()
+        if ahead:
+            read_ahead(source, FinetuneConfig())
+        run_fusion(source, result_of(robot, moved, alpha=other), folder, **SETTINGS)
+        files.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert len(loads) == 3
+    assert "trajectory.tum" in files[0]
+    assert files[0] == files[1] == files[2]
 
 
 def test_a_merge_has_no_more_gaussians_than_it_may(robot, tmp_path):
