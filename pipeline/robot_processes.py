@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
@@ -108,7 +109,8 @@ class RobotProcesses:
                 task.add_done_callback(share.done)
             meanwhile()
             wait(tasks, return_when=FIRST_COMPLETED)
-            import_next(self.plan)  # a processor has nothing else to do from now on
+            # a processor has nothing else to do from now on, and a disk may be slow
+            threading.Thread(target=import_next, args=(self.plan,), daemon=True).start()
             for task in tasks:
                 found |= task.result()
         return found
