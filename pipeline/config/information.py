@@ -29,7 +29,7 @@ class InformationConfig(Config):
     correlation_px: int = Field(default=4, ge=0)
     """Residuals of pixels this far apart in u and v are correlated with each other: about the reach of a Gaussian. What
     they share counts once; 0 takes every pixel for independent."""
-    deviation_frames: int = Field(default=48, ge=0)
+    deviation_frames: int = Field(default=24, ge=0)
     """Most frames between keyframes, evenly spread over the log and none held out, whose depth shows, besides that of
     keyframes, how far Gaussians are from the surface."""
     deviation_gate_m: float = Field(default=0.1, gt=0.0)
