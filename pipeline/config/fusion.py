@@ -128,7 +128,7 @@ class StatedScaleConfig(Config):
     """Own depth images that must have measured a surface near a Gaussian."""
     min_gaussians: int = Field(default=100, ge=1)
     """Such Gaussians that a peer needs to be asked; the factor is the median of those that peers ask for."""
-    views: int = Field(default=128, ge=1)
+    views: int = Field(default=24, ge=1)
     """Most own depth images that are looked at, evenly spaced."""
     most: float = Field(default=5.0, ge=1.0)
     """Largest factor: where a peer asks for more, it is wrong rather than the cameras."""
