@@ -27,8 +27,8 @@ LEAST_KNOWN = 0.5
 """Share of the pixels of a block that then have a depth."""
 MOST_ROWS = 16_384
 """Of an image that OpenCV is given: it takes less than 32,767."""
-MOST_KEPT = 1024
-"""Frames whose blocks are kept: 80 kB each."""
+MOST_KEPT_BYTES = 80 << 20
+"""Of blocks that are kept: those of a thousand frames with the usual width."""
 UNIT_COLORS = np.arange(256, dtype=np.float32) * np.float32(1 / 255)
 UNIT_COLORS[: CLIPPED[0]] = UNIT_COLORS[CLIPPED[1] + 1 :] = np.nan
 """Of 8 bits; NaN where they are clipped."""
@@ -47,6 +47,11 @@ class ColorBlocks:
     camera: PinholeCamera
     color: NDArray[np.float32]
     inverse_depth: NDArray[np.float32]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the images."""
+        return self.color.nbytes + self.inverse_depth.nbytes
 
     @staticmethod
     def of(frame: RgbdFrame, camera: PinholeCamera, width_px: int) -> ColorBlocks:
@@ -154,6 +159,7 @@ class BlocksOfLog:
         """
         self._log, self._width_px = log, width_px
         self._kept = dict[tuple[int, int | None], ColorBlocks]()
+        self._kept_bytes = 0
 
     def keep(self, frame: RgbdFrame) -> None:
         """Keep the blocks of a frame, if they may be asked for and are not too many.
@@ -162,8 +168,13 @@ class BlocksOfLog:
             frame: of the log, as it was read.
         """
         times = self._log.pairing.pairs[frame.index]
-        if len(self._kept) < MOST_KEPT and times[1] in (None, times[0]) and not is_held_out(frame.index):
-            self._kept[times] = self._of(frame)
+        if (
+            self._kept_bytes < MOST_KEPT_BYTES
+            and times[1] in (None, times[0])
+            and not is_held_out(frame.index)
+        ):
+            self._kept[times] = blocks = self._of(frame)
+            self._kept_bytes += blocks.nbytes
 
     def of(self, index: int) -> ColorBlocks:
         """Blocks of a frame, which are not kept any longer.
@@ -171,7 +182,7 @@ class BlocksOfLog:
         Args:
             index: of the frame in the log.
         """
-        kept = self._kept.pop(self._log.pairing.pairs[index], None)
+        kept = self._taken(index)
         return self._of(self._log.frame(index, still=False)) if kept is None else kept
 
     def forget(self, indices: Iterable[int]) -> None:
@@ -181,7 +192,13 @@ class BlocksOfLog:
             indices: of the frames in the log.
         """
         for index in indices:
-            self._kept.pop(self._log.pairing.pairs[index], None)
+            self._taken(index)
+
+    def _taken(self, index: int) -> ColorBlocks | None:
+        blocks = self._kept.pop(self._log.pairing.pairs[index], None)
+        if blocks is not None:
+            self._kept_bytes -= blocks.nbytes
+        return blocks
 
     def _of(self, frame: RgbdFrame) -> ColorBlocks:
         return ColorBlocks.of(frame, self._log.camera, self._width_px)

@@ -84,12 +84,17 @@ def test_blocks_are_forgotten_where_depth_turns_out_to_be_late(log: RgbdLog) -> 
     assert blocks.computed == 4
 
 
-def test_so_many_are_kept(log: RgbdLog, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(color_blocks, "MOST_KEPT", 2)
+def test_so_many_are_kept_as_have_room(log: RgbdLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    of_one = ColorBlocks.of(log.frame(0), CAMERA, WIDTH_PX).nbytes
+    assert of_one == 16 * 12 * 4 * 4
+    monkeypatch.setattr(color_blocks, "MOST_KEPT_BYTES", 2 * of_one)
     blocks = CountingBlocks(log, WIDTH_PX)
     for frame in log.frames():
         blocks.keep(frame)
     assert blocks.computed == 2
+    blocks.forget([0])
+    blocks.keep(log.frame(3))
+    assert blocks.computed == 3
 
 
 def test_clipped_colors_are_no_colors() -> None:
