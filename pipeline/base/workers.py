@@ -13,14 +13,14 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
 
-LEAST_PRIORITY = 19
-"""Nice value of what waits for all others."""
+LOW_PRIORITY = 10
+"""Nice value of what can wait: a tenth of a processor is left to it next to a task that cannot."""
 _handed_down: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
 
 
@@ -113,7 +113,7 @@ def end_with_parent() -> None:
 
 
 def when_idle(do: Callable[[], None]) -> None:
-    """Do something in the time that others leave of the processors; as anything else where that cannot be asked for.
+    """Do something mostly in the time that others leave of the processors, where that can be asked for.
 
     Args:
         do: what to do; its errors are raised here.
@@ -121,11 +121,11 @@ def when_idle(do: Callable[[], None]) -> None:
     failed: list[BaseException] = []
 
     def in_thread() -> None:
-        if (
-            sys.platform == "linux"
-        ):  # where threads have priorities of their own, which cannot be raised again
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LEAST_PRIORITY)
         try:
+            # threads have priorities of their own on Linux; what was lowered cannot be raised again
+            if sys.platform == "linux":
+                with suppress(OSError):
+                    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOW_PRIORITY)
             do()
         except BaseException as error:
             failed.append(error)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.workers import LEAST_PRIORITY, when_idle, worker_pool
+from duagc.pipeline.base.workers import LOW_PRIORITY, when_idle, worker_pool
 
 ROOT = Path(__file__).parents[2]
 
@@ -59,7 +59,7 @@ def test_an_error_ends_the_tasks_of_the_others() -> None:
 def test_workers_end_with_a_killed_parent() -> None:
     code = """
 import os, time
-from duagc.pipeline.base.workers import LEAST_PRIORITY, when_idle, worker_pool
+from duagc.pipeline.base.workers import LOW_PRIORITY, when_idle, worker_pool
 if __name__ == "__main__":
     with worker_pool(1) as pool:
         print(pool.submit(os.getpid).result(), flush=True)
@@ -85,8 +85,8 @@ def test_what_can_wait_leaves_the_processors_to_others() -> None:
     found: list[int] = []
     when_idle(lambda: found.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
     own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-    assert own < LEAST_PRIORITY
-    assert found == [LEAST_PRIORITY if sys.platform == "linux" else own]
+    assert own < LOW_PRIORITY
+    assert found == [LOW_PRIORITY if sys.platform == "linux" else own]
 
 
 def test_an_error_of_what_can_wait_is_an_error_here() -> None:
