@@ -143,7 +143,8 @@ class RobotProcesses:
             pools = [stack.enter_context(worker_pool(1, keep_share, share.handed)) for _ in range(workers)]
             for pool, robot in zip(pools, robots, strict=False):
                 pool.submit(import_module, FUSION)
-                pool.submit(self.read_ahead, robot)
+                if not self.plan.has(stages.EVALUATION):  # part of which leaves no processor idle now
+                    pool.submit(self.read_ahead, robot)
             yield FusionProcesses(pools, share, robots)
 
     def read_ahead(self, robot: str) -> None:
