@@ -109,7 +109,7 @@ class RobotProcesses:
                 task.add_done_callback(share.done)
             meanwhile()
             wait(tasks, return_when=FIRST_COMPLETED)
-            # a processor has nothing else to do from now on, and a disk may be slow
+            # where no robot is left a processor has nothing else to do, and a disk may be slow
             threading.Thread(target=import_next, args=(self.plan,), daemon=True).start()
             for task in tasks:
                 found |= task.result()
