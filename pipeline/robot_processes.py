@@ -13,6 +13,7 @@ from typing import Any
 
 from duagc.pipeline import steps, watch
 from duagc.pipeline.base import worker_reports
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.thread_share import SharedThreads, ThreadShare, keep_share
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.cache.carrier import Carried
@@ -41,7 +42,11 @@ def import_next(plan: RunPlan) -> None:
         wanted += VIEW
     for module in wanted:
         with suppress(ImportError):
-            import_module(module)
+            _import(module)
+
+
+def _import(module: str) -> None:
+    import_module(module)
 
 
 @dataclass(frozen=True)
@@ -52,11 +57,13 @@ class FusionProcesses:
         pools: of one process each, which reads ahead for the robot of the same place.
         share: of the machine's threads.
         robots: that they are for.
+        begun: what they do before.
     """
 
     pools: Sequence[ProcessPoolExecutor]
     share: ThreadShare
     robots: Sequence[str]
+    begun: Sequence[Future[Any]]
 
 
 @dataclass(frozen=True)
@@ -141,11 +148,11 @@ class RobotProcesses:
         share = ThreadShare(workers, len(robots))
         with ExitStack() as stack:
             pools = [stack.enter_context(worker_pool(1, keep_share, share.handed)) for _ in range(workers)]
-            for pool, robot in zip(pools, robots, strict=False):
-                pool.submit(import_module, FUSION)
-                if not self.plan.has(stages.EVALUATION):  # part of which leaves no processor idle now
-                    pool.submit(self.read_ahead, robot)
-            yield FusionProcesses(pools, share, robots)
+            begun: list[Future[Any]] = [pool.submit(_import, FUSION) for pool in pools]
+            if not self.plan.has(stages.EVALUATION):  # part of which leaves no processor idle now
+                first = zip(pools, robots, strict=False)
+                begun += [pool.submit(self.read_ahead, robot) for pool, robot in first]
+            yield FusionProcesses(pools, share, robots, begun)
 
     def read_ahead(self, robot: str) -> None:
         """Read what the fusion of a robot needs, in a process of its own. The fusion reports what is wrong.
@@ -153,8 +160,9 @@ class RobotProcesses:
         Args:
             robot: its name.
         """
-        log = Recording(self.recording).log(robot)
-        steps.read_ahead(robot, log, self.folder / "robots" / robot, self.config)
+        with suppress(DuagError):
+            log = Recording(self.recording).log(robot)
+            steps.read_ahead(robot, log, self.folder / "robots" / robot, self.config)
 
     def fuse(
         self,
@@ -190,6 +198,8 @@ class RobotProcesses:
             for task in wait(running, return_when=FIRST_COMPLETED).done:
                 task.result()
                 begin(running.pop(task))
+        for task_before in ready.begun:
+            task_before.result()  # raises what should not have happened
         return {name: tasks[name].result() for name in robots}
 
     def fuse_one(self, name: str, robot: Prepared, exchange: Carried) -> Carried:

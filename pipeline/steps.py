@@ -225,11 +225,11 @@ def read_ahead(robot: str, log: Path, folder: Path, config: RunConfig) -> None:
         config: of the run.
     """
     from duagc.pipeline.base.workers import when_idle
-    from duagc.pipeline.fusion.own_images import read_ahead
+    from duagc.pipeline.fusion import own_images
 
     determinism.configure_opencv()
     source = agent_input(robot, log, folder, config)
-    when_idle(lambda: read_ahead(source, config.fusion.finetune))
+    when_idle(lambda: own_images.read_ahead(source, config.fusion.finetune))
 
 
 def fuse_robot(

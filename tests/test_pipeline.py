@@ -201,7 +201,8 @@ def test_the_log_of_another_robot_is_refused(small_runs: Path, small_recording: 
 
 def test_nothing_delivered_is_nothing_said(small_runs: Path, small_recording: Path, small_run: Path) -> None:
     off = "exchange.link.enabled=false"
-    silent = make_run(small_recording, small_runs / "run_silent", off, workers=1, until="fusion")
+    # the processes of a run that is not evaluated read ahead for their fusion
+    silent = make_run(small_recording, small_runs / "run_silent", off, workers=2, until="fusion")
     deaf = exchanged_again(
         silent, small_recording, small_runs / "run_deaf", "exchange.link.loss_probability=1.0"
     )

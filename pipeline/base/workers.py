@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -118,23 +118,15 @@ def when_idle(do: Callable[[], None]) -> None:
     Args:
         do: what to do; its errors are raised here.
     """
-    failed: list[BaseException] = []
+    with ThreadPoolExecutor(1, initializer=_lower_priority) as thread:
+        thread.submit(do).result()
 
-    def in_thread() -> None:
-        try:
-            # threads have priorities of their own on Linux; what was lowered cannot be raised again
-            if sys.platform == "linux":
-                with suppress(OSError):
-                    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOW_PRIORITY)
-            do()
-        except BaseException as error:
-            failed.append(error)
 
-    thread = threading.Thread(target=in_thread)
-    thread.start()
-    thread.join()
-    if failed:
-        raise failed[0]
+def _lower_priority() -> None:
+    """Of this thread, for good; only on Linux have threads priorities of their own."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOW_PRIORITY)
 
 
 def peak_memory_bytes() -> int:

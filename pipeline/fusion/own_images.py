@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -47,11 +48,11 @@ class OwnImages:
             T_world_camera: [n, 4, 4], of all frames that have a pose, in order, in the frame of the views.
             moving: as the front end looked for what moves.
         """
-        free, views = FreeSpace(self.camera, moving), []
-        for number, (image, place) in enumerate(zip(self.images, self.places, strict=True)):
-            views.append(replace(image, T_world_camera=T_world_camera[place]))
-            if number < self.keyframes:
-                free.add(image.depth_m, T_world_camera[place])
+        at = zip(self.images, self.places, strict=True)
+        views = [replace(image, T_world_camera=T_world_camera[place]) for image, place in at]
+        free = FreeSpace(self.camera, moving)
+        for view in views[: self.keyframes]:
+            free.add(view.depth_m, view.T_world_camera)
         return ShelvedList(replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views)
 
 
@@ -60,14 +61,36 @@ class OwnFiles:
     """What a robot's fusion reads of its own.
 
     Attributes:
-        own: its own results.
+        source: the files.
+        config: how many frames between keyframes take part.
+        own: the robot's own results.
         frames: that have a pose, in order.
-        images: gives those that the final map is trained on.
     """
 
+    source: AgentInput
+    config: FinetuneConfig
     own: RobotData
     frames: Sequence[Odometry]
-    images: Callable[[], OwnImages]
+
+    @staticmethod
+    def read(source: AgentInput, config: FinetuneConfig) -> OwnFiles:
+        """All but the images.
+
+        Args:
+            source: the files.
+            config: how many frames between keyframes take part.
+        Raises:
+            DuagError: a file lacks what it should hold, or two files do not belong together.
+        """
+        return OwnFiles(source, config, SHELF.put(load(source)), _placed_frames(source))
+
+    @cached_property
+    def images(self) -> OwnImages:
+        """Those that the final map is trained on; read when they are asked for."""
+        own, config = self.own, self.config
+        num_support = config.at_most(config.support_views, own.keyframes)
+        seen_m = blur_distance_m(own.gaussians, own.T_map_keyframe, own.depth)
+        return training_images(self.source, self.frames, num_support=num_support, seen_m=seen_m)
 
 
 _read_ahead: dict[Path, OwnFiles] = {}
@@ -82,9 +105,9 @@ def read_ahead(source: AgentInput, config: FinetuneConfig) -> None:
     Raises:
         DuagError: a file lacks what it should hold, or two files do not belong together.
     """
-    files = _read(source, config)
-    images = files.images()
-    _read_ahead[source.frontend] = replace(files, images=lambda: images)
+    files = OwnFiles.read(source, config)
+    _ = files.images
+    _read_ahead[source.frontend] = files
 
 
 def take_read_ahead(source: AgentInput, config: FinetuneConfig) -> OwnFiles:
@@ -97,16 +120,7 @@ def take_read_ahead(source: AgentInput, config: FinetuneConfig) -> OwnFiles:
         DuagError: a file lacks what it should hold, or two files do not belong together.
     """
     known = _read_ahead.pop(source.frontend, None)
-    return _read(source, config) if known is None else known
-
-
-def _read(source: AgentInput, config: FinetuneConfig) -> OwnFiles:
-    own, frames = SHELF.put(load(source)), _placed_frames(source)
-    num_support = config.at_most(config.support_views, own.keyframes)
-    seen_m = blur_distance_m(own.gaussians, own.T_map_keyframe, own.depth)
-    return OwnFiles(
-        own, frames, lambda: training_images(source, frames, num_support=num_support, seen_m=seen_m)
-    )
+    return OwnFiles.read(source, config) if known is None else known
 
 
 def training_images(

@@ -102,7 +102,7 @@ def run_fusion(
     context = MapContext(own.camera, config, matching, own.depth, weights, threads, seed=seed)
     views: Sequence[PosedRgbd] = []
     if len(result.component) > 1:
-        views = read.images().views(T_world_camera, moving)
+        views = read.images.views(T_world_camera, moving)
     fusion = _fuse(own, result, views, context, save=checkpoints or Checkpoints())
     SHELF.sweep(heap=True)
     refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
