@@ -1,8 +1,9 @@
 """A recording as a calibration of its cameras has it, made from its logs: no converter, no file of the dataset.
 
-Depth stays on the pixels of the recording, its values are corrected. Color is resampled to how a pinhole camera would
-see the scene that is where depth was registered to. So the camera of the recording stays as it is, and what resampling
-leaves without a color goes into the mask of pixels that show no scene. Other topics and ground truth are copied.
+Depth stays on the pixels of the recording, its values are corrected. Color is seen as by a pinhole camera that is where
+depth was registered to: its images stay as they are, and the log states their lens; where it stated one before they are
+resampled. So the camera of the recording stays as it is, and what it does not see goes into the mask of pixels that
+show no scene. Other topics and ground truth are copied.
 """
 
 from __future__ import annotations
@@ -18,17 +19,18 @@ from typing import Any
 import cv2
 import numpy as np
 
-from duagc.converters.layouts.calibrated import ColorLens, correct, resampled
-from duagc.converters.layouts.validity import Maps, of_maps
+from duagc.converters.layouts.calibrated import correct
 from duagc.pipeline import messages
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.base.files import encode_png
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import depth_error
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens, Maps, rectified, seen_by_source
 from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.recording import DEPTH_SCALE_KEY, RECORDING_FILE, LogWriter, Record, Recording, open_rgbd
+from duagc.pipeline.recording.color_images import ColorImages
 from duagc.pipeline.recording.depth_sources import Lidar, OtherCamera, depth_source
 from duagc.pipeline.recording.read import LogFile, log_metadata
 from duagc.schemas import topics
@@ -46,7 +48,7 @@ class Correction:
         delay_ns: how much later color was taken than its stamps say; stamps of depth become that much earlier.
     """
 
-    lens: ColorLens
+    lens: Lens
     depth_error: tuple[float, ...]
     delay_ns: int = 0
 
@@ -113,9 +115,10 @@ def _write_log(path: Path, out: Path, correction: Correction) -> dict[str, Any]:
     if why := why_not(path):
         raise DuagError(why)
     with open_rgbd(path) as rgbd:
-        robot, camera, valid = rgbd.robot, rgbd.camera, rgbd.valid
+        robot, camera, valid, lens = rgbd.robot, rgbd.camera, rgbd.valid, rgbd.lens
     with LogFile(path) as log, LogWriter(out, robot, log_metadata(path)) as writer:
-        copy = _Copy(log, robot, camera, valid, correction=correction, writer=writer)
+        cameras = camera, lens
+        copy = _Copy(log, robot, cameras, valid, correction=correction, writer=writer)
         statistics = log.summary.statistics
         for record in track(
             log.records(None), f"calibrate {robot}", statistics.message_count if statistics else None
@@ -131,17 +134,18 @@ class _Copy:
         self,
         log: LogFile,
         robot: str,
-        camera: PinholeCamera,
+        cameras: tuple[PinholeCamera, Lens | None],
         valid: Mask | None,
         *,
         correction: Correction,
         writer: LogWriter,
     ) -> None:
-        self._log, self._robot, self._camera = log, robot, camera
+        camera, lens = cameras
+        self._log, self._robot, self._camera, self._lens = log, robot, camera, lens
         self._correction, self._writer = correction, writer
         self._maps: Maps = correction.lens.maps(camera)
         self._source = depth_source(log, robot, camera)
-        whole = of_maps(self._maps, camera.width, camera.height)
+        whole = seen_by_source(self._maps, camera.width, camera.height)
         # depth is not moved: what was no scene before is none either
         self.valid = whole if valid is None else whole & valid & self._moved(valid)
         if not self.valid.any():
@@ -149,6 +153,7 @@ class _Copy:
                 f"{log.path}: its calibration leaves no pixel that shows the scene, expected some"
             )
         handlers: dict[topics.Topic, Callable[[Record], None]] = {
+            topics.CALIBRATION: self._calibration,
             topics.COLOR: self._color,
             topics.MASK: self._mask,
             topics.DEPTH: self._depth,
@@ -161,7 +166,7 @@ class _Copy:
                 topics.VALID
             ]
         self._handlers = {topic.of(robot): handler for topic, handler in handlers.items()}
-        self._has_color = False
+        self._has_color, self._images = False, ColorImages(camera, lens)
         self._opened: set[topics.Topic] = set()
 
     def add(self, record: Record) -> None:
@@ -179,6 +184,12 @@ class _Copy:
             cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
         )
 
+    def _calibration(self, record: Record) -> None:
+        """Images of a pinhole camera are kept, and their lens is stated; those of a lens are resampled."""
+        lens = self._correction.lens if self._lens is None else None
+        message = messages.pack_calibration(record.publish_time_ns, self._robot, self._camera, lens)
+        self._writer.write(record.topic, message, record.log_time_ns, record.publish_time_ns)
+
     def _color(self, record: Record) -> None:
         if not self._has_color and not self.valid.all():
             shown = messages.pack_valid(record.publish_time_ns, self._robot, self.valid)
@@ -186,12 +197,12 @@ class _Copy:
                 topics.VALID.of(self._robot), shown, record.log_time_ns, record.publish_time_ns
             )
         self._has_color = True
+        image = self._images.decode(record)
+        if self._lens is None:
+            self._writer.copy(self._log, record)
+            return
         message = record.proto()
-        image = decode_image(message.data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            where = f"{record.path}: {record.topic} at {record.publish_time_ns} ns"
-            raise DuagError(f"{where}: no decoder reads it, expected a color image")
-        message.data, message.format = resampled(image, self._maps), "png"
+        message.data, message.format = encode_png(rectified(image, self._maps)[:, :, ::-1]), "png"
         self._writer.write(record.topic, message, record.log_time_ns, record.publish_time_ns)
 
     def _mask(self, record: Record) -> None:

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.found_regions import FoundRegions
+from duagc.converters.layouts.sound_camera import check_camera
 from duagc.converters.layouts.validity import mask_of_user
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.geometry.camera import MAX_SIDE_PX, PinholeCamera
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens, seen_by_source
 from duagc.pipeline.recording import (
     DEPTH_SCALE_KEY,
     RANGE_SIGMA_KEY,
@@ -28,21 +30,8 @@ from duagc.pipeline.recording import (
 from duagc.schemas import topics
 
 NANOSECONDS = 1_000_000_000
-MAX_FOCAL_PX = 1e6
 FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
 SIGMA_SCALE_M = 1e-4  # of the images of standard deviations
-
-
-def check_camera(camera: PinholeCamera, where: str) -> None:
-    """Refuse intrinsics that no camera has: they came from a file."""
-    sides, focals = (camera.width, camera.height), (camera.fx, camera.fy)
-    sound = all(1 <= side <= MAX_SIDE_PX for side in sides)
-    sound = sound and all(0 < focal < MAX_FOCAL_PX for focal in focals)
-    sound = sound and all(abs(center) < MAX_FOCAL_PX for center in (camera.cx, camera.cy))
-    if not sound:
-        raise DuagError(
-            f"{where}: camera {camera}, expected sides up to {MAX_SIDE_PX} px and sound intrinsics"
-        )
 
 
 class RobotWriter:
@@ -89,6 +78,7 @@ class RobotWriter:
         self._has_depth = self._has_exact_depth = self._has_sigma = False
         self._valid = mask_of_user(name, camera.width, camera.height)
         self._regions = FoundRegions() if find_regions else None
+        self._lens: Lens | None = None
         self._shares: dict[str, float] = {}  # of the pixels that were found to show something else
         # topic of a sensor's pose in the camera that is still to be written
         self._sensors: dict[str, NDArray[np.float64]] = {}
@@ -111,6 +101,19 @@ class RobotWriter:
             raise ValueError(f"robot {self.name}: the mask comes after the first frame")
         self._check_size(valid)
         self._valid = valid if self._valid is None else self._valid & valid
+
+    def set_lens(self, lens: Lens | None) -> None:
+        """Say with which lens color is taken, before the first frame; pixels that it does not see are left out.
+
+        Args:
+            lens: of images that are written as they are, as large as the camera's; None: they are the camera's.
+        """
+        if lens is None:
+            return
+        maps, self._lens = lens.maps(self.camera), lens
+        self.set_valid(seen_by_source(maps, lens.source.width, lens.source.height))
+        if self._regions is not None:
+            self._regions = FoundRegions(maps)
 
     def _leave_out_found(self) -> None:
         """Write another mask of all images, at the end, where a region was found that does not show the scene."""
@@ -151,7 +154,7 @@ class RobotWriter:
 
         Args:
             stamp_ns: time of the recording, increasing.
-            color: the encoded color image as it is.
+            color: the encoded color image as it is, of the lens if there is one.
             color_format: "jpeg" or "png".
             depth: uint16 [H, W] in units of depth_scale along z, registered to color, 0 = none. None: the
                 depth is that of another camera or a LiDAR.
@@ -170,7 +173,7 @@ class RobotWriter:
         self._check_frame(stamp_ns, color_format, (depth, mask, true_mask, depth_sigma_m))
         name = self.name
         if not self._stamps:
-            calibration = messages.pack_calibration(stamp_ns, name, self.camera)
+            calibration = messages.pack_calibration(stamp_ns, name, self.camera, self._lens)
             self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
             self._write_valid(stamp_ns)
         index = len(self._stamps)

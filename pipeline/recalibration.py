@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from duagc.converters.calibrated_copy import Correction, why_not, write_calibrated
-from duagc.converters.layouts.calibrated import ColorLens
 from duagc.pipeline.base import determinism
 from duagc.pipeline.camera_calibration import report
 from duagc.pipeline.camera_calibration.calibrate import Calibration, calibrate
@@ -17,6 +16,7 @@ from duagc.pipeline.config.calibration import CalibrationConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.recording import Recording, open_rgbd
 
 
@@ -146,9 +146,7 @@ def _correction(outcome: CalibrationOutcome) -> Correction:
     rig = outcome.found.rig
     c = rig.camera
     fx, fy, cx, cy, k1, k2, k3 = rig.lens.tolist()
-    lens = ColorLens(
-        PinholeCamera(c.width, c.height, fx, fy, cx, cy),
-        (k1, k2, 0.0, 0.0, k3),
-        tuple(so3.log(rig.R_color_depth).tolist()),
-    )
+    x, y, z = so3.log(rig.R_color_depth).tolist()
+    source = PinholeCamera(c.width, c.height, fx, fy, cx, cy)
+    lens = Lens(source, (k1, k2, 0.0, 0.0, k3), rotation_rad=(x, y, z))
     return Correction(lens, tuple(rig.depth_error.tolist()), outcome.delay_ns)

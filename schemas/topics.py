@@ -77,7 +77,7 @@ CALIBRATION = Topic(
     "foxglove.CameraCalibration",
     "converters",
     Scope.SENSOR,
-    "pinhole intrinsics of the color camera",
+    "K and D of color images; P of the pinhole camera that they are read as, which depth and masks belong to",
 )
 RAW_DEPTH = Topic(
     "/<robot>/depth_camera/depth",

@@ -39,7 +39,7 @@ class Options(tum_layout.SequenceOptions):
     """Lens and association."""
 
     undistort: bool = True
-    """Take the lens distortion out of color and depth together."""
+    """Take the lens distortion out of depth, and of color on reading."""
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:

@@ -3,7 +3,7 @@
 SRC is a bag, or the folder of a sequence (`10_14_<robot>.bag`, ...). Robots are known by the namespace of their
 topics: in some bags `frame_id` names another robot. The bags hold no /tf: the factory's extrinsics of the cameras, as
 the dataset's repository publishes them, are in this file. Depth is seen from the left infrared camera and is registered
-to color; color is undistorted. The true poses are of the robot's body, from LiDAR SLAM.
+to color as it looks without distortion. The true poses are of the robot's body, from LiDAR SLAM.
 """
 
 from __future__ import annotations

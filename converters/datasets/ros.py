@@ -2,8 +2,8 @@
 
 SRC is a `.bag`, a `.db3`, an `.mcap` or a folder of `ros2 bag`; a folder with one of these per robot, or with a folder
 of them per robot; or a TOML file that says which logs and topics each robot has (`duagc info LOG --toml`). Images are
-paired by the stamps of their headers. Color is undistorted, and depth that another camera saw is registered to it,
-with extrinsics from the log's constant transforms or given ones.
+paired by the stamps of their headers. Color keeps its distortion, and depth that another camera saw is registered to it
+as it looks without, with extrinsics from the log's constant transforms or given ones.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.atomic_folder import check_apart
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import decode_image, encode_png
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
@@ -164,6 +163,7 @@ def write_robot(
     """
     sensors = {"part": label, **source.sensors()}
     with recording.robot(name, source.camera, source.depth_scale, sensors) as robot:
+        robot.set_lens(source.lens)
         robot.set_valid(source.valid)
         recording.checks[name] = _write_frames(robot, source, max_ratio, gap)
     recording.warnings += [f"{name}: {text}" for text in source.warnings]
@@ -275,18 +275,12 @@ def _measured(
     import cv2
 
     farthest_m, float_unit = rules
-    log, maps = source.name, source.color_maps
+    log = source.name
     where = f"{log}: {source.color} at {stamp_ns} ns"
     data, color_format = color_bytes(color, where)
     _check_size(where, encoded_size(data) or (0, 0), source.camera)
-    if maps is None and hasattr(color, "format"):
+    if hasattr(color, "format"):
         check_decodes(data, where)
-    if maps is not None:
-        image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            raise UnusableImage(f"{where}: no decoder reads it, expected a color image")
-        data = encode_png(np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR)))
-        color_format = "png"
     if depth is None:
         return Picture(data, color_format), 0
     where = f"{log}: {source.depth} at {stamp_ns} ns"

@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator
 
 from duagc.converters.layouts import reference_poses
-from duagc.converters.layouts.calibrated import ColorLens, correct, numbers, resampled
+from duagc.converters.layouts.calibrated import correct, is_pinhole, numbers, square_camera
 from duagc.converters.layouts.displaced_depth import DepthRegistration
-from duagc.converters.layouts.image_files import kept_color, options_of, read_color, read_depth, rigid
+from duagc.converters.layouts.image_files import kept_color, options_of, read_depth, rigid
 from duagc.converters.layouts.image_folder import LengthOptions
 from duagc.converters.layouts.self_check import ReprojectionCheck
-from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
@@ -35,6 +34,7 @@ from duagc.pipeline.base.files import read_text
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import depth_error, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens
 
 Depth = Array
 Reference = dict[int, Array]  # T_world_color [4, 4] by frame number
@@ -76,7 +76,7 @@ class Options(LengthOptions):
     """Focal length of the color camera along y; 0: that along x."""
     color_distortion: str = ""
     """Lens of the color camera: k1 k2 p1 p2 [k3] as OpenCV has them; empty: none. With this option, the one before or
-    the one after, color is resampled as a pinhole camera sees it that is turned as the depth camera is."""
+    the one after, color is seen as by a pinhole camera that is turned as the depth camera is."""
     color_rotation_rad: str = ""
     """Rotation vector x y z that takes directions of the depth camera to those of the color camera; empty: none."""
     depth_correction_per_m: str = ""
@@ -104,16 +104,17 @@ class Options(LengthOptions):
         numbers(text, LENGTHS[info.field_name])
         return text
 
-    def lens(self) -> ColorLens:
+    def lens(self) -> Lens:
         """The camera that the color images were taken with."""
         f, fy = self.color_focal_px, self.color_focal_y_px or self.color_focal_px
         source = PinholeCamera(WIDTH, HEIGHT, f, fy, self.color_cx_px, self.color_cy_px)
-        rotation = numbers(self.color_rotation_rad, LENGTHS["color_rotation_rad"])
-        return ColorLens(source, numbers(self.color_distortion, LENGTHS["color_distortion"]), rotation)
+        x, y, z = numbers(self.color_rotation_rad, LENGTHS["color_rotation_rad"]) or (0.0, 0.0, 0.0)
+        distortion = numbers(self.color_distortion, LENGTHS["color_distortion"])
+        return Lens(source, distortion, rotation_rad=(x, y, z))
 
     def color_camera(self) -> PinholeCamera:
         """The camera of the color images in the recording."""
-        return self.lens().camera
+        return square_camera(self.lens())
 
     def depth_correction(self) -> tuple[float, ...]:
         """c0 .. c5, or nothing."""
@@ -294,15 +295,12 @@ def _write_robot(
     register = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)
     check = ReprojectionCheck(options.color_camera(), len(frames))
     lens, correction = options.lens(), options.depth_correction()
-    maps = None if lens.is_pinhole else lens.maps()
-    robot.set_valid(None if maps is None else of_maps(maps, WIDTH, HEIGHT))
+    robot.set_lens(None if is_pinhole(lens) else lens)
     holes = invalid = 0
 
     def images(files: SevenScenesFrame) -> tuple[bytes, str, Depth]:
         depth = register(correct(_depth_m(files.depth), options.depth_camera(), correction))
-        if maps is None:
-            return *kept_color(files.color, (WIDTH, HEIGHT)), depth
-        return resampled(read_color(files.color, (WIDTH, HEIGHT)), maps), "png", depth
+        return *kept_color(files.color, (WIDTH, HEIGHT)), depth
 
     found = zip(frames, in_order(images, frames), strict=True)
     titled = track(found, f"convert {robot.name}", total=len(frames))
@@ -323,7 +321,8 @@ def _true_pose(files: SevenScenesFrame, reference: Reference | None, options: Op
     """T_world_camera [4, 4] of the recording's camera, None where it is not known."""
     if reference is not None:
         T_world_color = reference.get(files.number)
-        return None if T_world_color is None else T_world_color @ options.lens().turned()
+        T_color_camera = se3.from_rotation_translation(options.lens().rotation(), np.zeros(3))
+        return None if T_world_color is None else T_world_color @ T_color_camera
     if files.pose is None:
         return None
     T_depth_camera = se3.from_rotation_translation(np.eye(3), [options.baseline_m, 0.0, 0.0])

@@ -1,8 +1,8 @@
 """TUM RGB-D: handheld and robot sequences with motion capture, Kinect v1; and others in this layout.
 
 SRC is a sequence, for example `rgbd_dataset_freiburg1_desk`: `rgb.txt`, `depth.txt` (time, file), `groundtruth.txt`
-(pose of the color camera). Depth is registered to the distorted color image, so both are undistorted together. Of other
-cameras the intrinsics are in `calibration.txt` (`fx fy cx cy`, as ETH3D has it) or an option.
+(pose of the color camera). Depth is registered to the distorted color image: it is undistorted here, color when it is
+read. Of other cameras the intrinsics are in `calibration.txt` (`fx fy cx cy`, as ETH3D has it) or an option.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from duagc.converters.layouts import image_folder, tum_layout
 from duagc.converters.layouts.image_files import image_size, options_of
 from duagc.converters.layouts.image_folder import Clip
 from duagc.converters.layouts.kinect import KINECT_READOUT
-from duagc.converters.robot_writer import check_camera
+from duagc.converters.layouts.sound_camera import check_camera
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -50,8 +50,8 @@ class Options(tum_layout.SequenceOptions):
     depth_scale: float = Field(DEPTH_SCALE, gt=0)
     """Meters per unit of depth."""
     undistort: bool = True
-    """Take the lens distortion out of color and depth together; without, images stay as they are and a pinhole camera
-    does not describe them."""
+    """Take the lens distortion out of depth, and of color on reading; without, a pinhole camera does not describe
+    them."""
     rolling_shutter: Literal["auto", "none"] = "auto"
     """Readout of the images that the log states: auto is that of a first Kinect where the camera is one, none that all
     rows are read at once."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from duagc.converters.layouts.own_body import OwnBody
 from duagc.converters.layouts.validity import BlackBorder
 from duagc.pipeline.base.held_out import is_held_out
+from duagc.pipeline.geometry.lens import Maps
 from duagc.pipeline.geometry.masks import Mask
 
 EVERY, EVERY_NS = 8, 250_000_000  # a frame of so many is looked at, and one in so long a time
@@ -17,8 +18,13 @@ EVERY_OF_FIRST, MANY = 3, 32  # of the first frames more are looked at, so that 
 class FoundRegions:
     """Looks at some frames of a robot."""
 
-    def __init__(self) -> None:
-        self._black, self._body = BlackBorder(), OwnBody()
+    def __init__(self, maps: Maps | None = None) -> None:
+        """Set up.
+
+        Args:
+            maps: where in color images the pixels of the recording's camera lie; None: they are that camera's.
+        """
+        self._black, self._body = BlackBorder(maps), OwnBody()
         self._next_look_ns = 0
 
     def add(self, index: int, stamp_ns: int, color: bytes, depth: NDArray[np.uint16] | None) -> None:

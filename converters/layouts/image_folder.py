@@ -18,7 +18,6 @@ from pydantic import Field
 
 from duagc.converters.layouts.image_files import kept_color, read_color, read_depth
 from duagc.converters.layouts.self_check import ReprojectionCheck
-from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
@@ -30,6 +29,8 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens, Maps, rectified, seen_by_source
+from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.recording.greatest_depth import unmeasured
 
 Item = TypeVar("Item")
@@ -84,7 +85,7 @@ class Clip:
             resampled into `camera` (same place, same axes).
         depth_scale: meters per unit.
         no_depth: values that mean none.
-        distortion: (k1, k2, p1, p2, k3) of color and depth alike, removed; empty: none.
+        distortion: (k1, k2, p1, p2, k3) of color and depth alike: removed from depth, stated of color; empty: none.
     """
 
     label: str
@@ -179,9 +180,10 @@ def write(
                     "other: taken for none"
                 )
             with recording.robot(name, clip.camera, clip.depth_scale, sensors) as robot:
-                lens = _Lens(clip)
-                robot.set_valid(lens.valid)
-                check = _write_clip(robot, clip, lens, f"{src}: {clip.label}" if clip.label else str(src))
+                images = _Images(clip)
+                robot.set_lens(images.lens)
+                robot.set_valid(images.valid)
+                check = _write_clip(robot, clip, images, f"{src}: {clip.label}" if clip.label else str(src))
             numbers = {"first_frame": clip.frames[0].number, "last_frame": clip.frames[-1].number}
             recording.checks[name] = {**numbers, **check}
             without = sum(frame.T_world_camera is None for frame in clip.frames)
@@ -201,7 +203,7 @@ def _unmeasured(clip: Clip) -> tuple[int, float]:
     return int(greatest), share
 
 
-def _write_clip(robot: RobotWriter, clip: Clip, lens: _Lens, label: str) -> dict[str, Any]:
+def _write_clip(robot: RobotWriter, clip: Clip, images: _Images, label: str) -> dict[str, Any]:
     """Write all frames of a robot; returns what the self-check measured."""
     check = ReprojectionCheck(clip.camera, len(clip.frames))
     empty = count = 0
@@ -209,15 +211,15 @@ def _write_clip(robot: RobotWriter, clip: Clip, lens: _Lens, label: str) -> dict
     start_ns = _start_ns(clip)
     seen: NDArray[np.uint16] | None = None
 
-    def images(task: tuple[FrameFiles, bool]) -> tuple[bytes, str, NDArray[np.uint16] | None]:
+    def read(task: tuple[FrameFiles, bool]) -> tuple[bytes, str, NDArray[np.uint16] | None]:
         files, new_depth = task
         raw = None
         if new_depth and files.depth is not None:
-            raw = lens.depth(read_depth(files.depth, size, no_depth=clip.no_depth))
-        return *lens.color(files.color), raw
+            raw = images.depth(read_depth(files.depth, size, no_depth=clip.no_depth))
+        return *images.color(files.color), raw
 
     tasks = list(zip(clip.frames, _with_new_depth(clip.frames), strict=True))
-    found = zip(clip.frames, in_order(images, tasks), strict=True)
+    found = zip(clip.frames, in_order(read, tasks), strict=True)
     titled = track(found, f"convert {robot.name}", total=len(tasks))
     for index, (files, (color, color_format, raw)) in enumerate(titled):
         if raw is not None:
@@ -264,20 +266,27 @@ def _start_ns(clip: Clip) -> int:
     return min(stamps)
 
 
-class _Lens:
-    """Takes distortion out of color and depth, and color into the camera of the depth, where there is need.
+class _Images:
+    """Color and depth of a clip as they are written: depth without distortion, color in the camera of the depth.
 
-    valid: bool [H, W], pixels that are made of pixels of the source; None: all.
+    lens: with which color is taken that is kept as it is; None: it is that of the clip's camera.
+    valid: bool [H, W], pixels that are made of pixels of the source where color is resampled here; None: all.
     """
 
     def __init__(self, clip: Clip) -> None:
-        self._source = clip.color_camera or clip.camera
-        self._size = self._source.width, self._source.height
-        self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+        source = clip.color_camera or clip.camera
+        self._size = source.width, source.height
+        self._maps: Maps | None = None
         self._depth_too = bool(clip.distortion)
+        self.lens: Lens | None = None
+        self.valid: Mask | None = None
         if clip.distortion or clip.color_camera is not None:
-            self._maps = _maps(clip.camera, self._source, clip.distortion)
-        self.valid = None if self._maps is None else of_maps(self._maps, *self._size)
+            lens = Lens(source, clip.distortion)
+            self._maps = lens.maps(clip.camera)
+            if self._size == (clip.camera.width, clip.camera.height):
+                self.lens = lens
+            else:
+                self.valid = seen_by_source(self._maps, *self._size)
 
     def depth(self, raw: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """Depth [H, W]; never interpolated."""
@@ -288,23 +297,7 @@ class _Lens:
         return np.asarray(cv2.remap(raw, *self._maps, cv2.INTER_NEAREST), dtype=np.uint16)
 
     def color(self, path: Path) -> tuple[bytes, str]:
-        """Encoded color: the file's own bytes, or a PNG of what was resampled."""
-        import cv2
-
-        if self._maps is None:
+        """Encoded color: the file's own bytes, or a PNG of an image that got another size."""
+        if self._maps is None or self.lens is not None:
             return kept_color(path, self._size)
-        moved = cv2.remap(read_color(path, self._size), *self._maps, cv2.INTER_LINEAR)
-        return encode_png(np.asarray(moved)), "png"
-
-
-def _maps(
-    camera: PinholeCamera, source: PinholeCamera, distortion: tuple[float, ...]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where in the source every pixel of the camera lies."""
-    import cv2
-
-    K = np.array([[source.fx, 0, source.cx], [0, source.fy, source.cy], [0, 0, 1]])
-    rays = camera.rays().reshape(-1, 3)
-    pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(distortion or np.zeros(5)))
-    u, v = pixels.reshape(camera.height, camera.width, 2).astype(np.float32).transpose(2, 0, 1)
-    return u, v
+        return encode_png(rectified(read_color(path, self._size), self._maps)), "png"

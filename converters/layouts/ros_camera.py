@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import FISHEYE_NUMBERS, POLYNOMIAL_NUMBERS, Lens, Maps
 
+MAX_ROTATION_DEFECT = 0.01  # largest entry of R R^T - 1
 LONGEST_LENS = 200  # focal length over the longer side of the image, and the inverse
 FISHEYE = (
     "equidistant",
@@ -37,6 +39,7 @@ class RosCamera:
         fisheye: whether the distortion is that of the equidistant model.
         frame_id: without the slash that ROS 1 may put before it.
         is_straight: whether it says that there is no distortion, by numbers that are all zero.
+        rotation_rad: rotation vector [3] that takes directions of the rectified camera, of P, to those of this one.
     """
 
     camera: PinholeCamera
@@ -44,6 +47,7 @@ class RosCamera:
     fisheye: bool
     frame_id: str
     is_straight: bool = False
+    rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @staticmethod
     def of(message: Any, rectified: bool, where: str) -> RosCamera:
@@ -85,7 +89,7 @@ class RosCamera:
         fisheye = model in FISHEYE
         if fisheye:  # of four numbers, but drivers of RealSense send the five of their structure
             D = np.concatenate([D[:4], np.trim_zeros(D[4:], "b")])
-        lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
+        lengths = FISHEYE_NUMBERS if fisheye else POLYNOMIAL_NUMBERS
         if not fisheye and model not in POLYNOMIAL:
             known = ", ".join((*POLYNOMIAL[1:], *FISHEYE))
             raise DuagError(f"{where}: distortion model {model!r}, expected one of {known}")
@@ -93,28 +97,31 @@ class RosCamera:
             raise DuagError(
                 f"{where}: distortion {D.tolist()} of {model!r}, expected {' or '.join(map(str, lengths))} numbers"
             )
-        return RosCamera(camera, tuple(D.tolist()), fisheye, frame)
+        return RosCamera(camera, tuple(D.tolist()), fisheye, frame, rotation_rad=_turn(message, where))
 
-    def maps(
-        self, onto: PinholeCamera | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    @property
+    def lens(self) -> Lens | None:
+        """How its images are taken; None: as a pinhole camera does."""
+        if not self.distortion:
+            return None
+        return Lens(self.camera, self.distortion[:4] if self.fisheye else self.distortion, self.fisheye)
+
+    def maps(self, onto: PinholeCamera | None = None) -> Maps | None:
         """Where in its images every pixel of a pinhole at the same place lies; None without distortion.
 
         Args:
             onto: the pinhole; None: its own.
         """
-        import cv2
+        lens = self.lens
+        return None if lens is None else lens.maps(onto or self.camera)
 
-        if not self.distortion:
-            return None
-        c = self.camera
-        K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-        onto = onto or c
-        rays, zero = onto.rays().reshape(-1, 1, 3), np.zeros(3)
-        project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
-        if self.fisheye:
-            pixels, _ = project(rays, zero, zero, K, np.array(self.distortion[:4]))
-        else:
-            pixels, _ = project(rays, zero, zero, K, np.array(self.distortion))
-        u, v = pixels.reshape(onto.height, onto.width, 2).astype(np.float32).transpose(2, 0, 1)
-        return np.ascontiguousarray(u), np.ascontiguousarray(v)
+
+def _turn(message: Any, where: str) -> tuple[float, float, float]:
+    """The rotation vector of a CameraInfo from its rectified camera to that of its images."""
+    R = np.array(message.R if hasattr(message, "R") else message.r, dtype=np.float64)
+    if not np.any(R):  # nobody set it
+        return 0.0, 0.0, 0.0
+    if R.size != 9 or not np.abs(R.reshape(3, 3) @ R.reshape(3, 3).T - np.eye(3)).max() < MAX_ROTATION_DEFECT:
+        raise DuagError(f"{where}: R is {R.tolist()}, expected a rotation")
+    x, y, z = so3.log(so3.project(R.reshape(3, 3).T)).tolist()
+    return x, y, z

@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from duagc.converters.layouts.validity import of_maps, shrunk
+from duagc.converters.layouts.validity import shrunk
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import seen_by_source
 from duagc.pipeline.geometry.masks import Mask
 
 Image = NDArray[np.uint8]
@@ -201,7 +202,7 @@ class StereoRig:
         if self._maps is None:
             return None
         height, width = self._maps[0][0].shape  # of the source too
-        mask = of_maps(self._maps[0], width, height)[: self._whole.height, : self._whole.width]
+        mask = seen_by_source(self._maps[0], width, height)[: self._whole.height, : self._whole.width]
         return shrunk(mask, self.options.shrink)
 
     def rectify_left(self, image: Image) -> Image:

@@ -1,4 +1,4 @@
-"""Which pixels of a camera's images show the scene: what a resampled image has of its source, and what users say.
+"""Which pixels of a camera's images show the scene: what is black in all images, and what users say.
 
 A camera may show pixels that are none of the scene in every image: the rim that undistortion and rectification leave,
 a vignette that is black, the robot itself. The masks of this module are bool [H, W], True = shows the scene.
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, read_bytes
+from duagc.pipeline.geometry.lens import Maps, rectified
 from duagc.pipeline.geometry.masks import Mask
 
 ALL_ROBOTS = ""
@@ -27,26 +28,6 @@ BRIGHT_PERCENT = 75
 LEAST_IMAGES = 8  # that must tell
 LEAST_BLACK = 0.002  # of the pixels, in pieces that touch the border
 GROW_PX = 4  # a vignette does not end from one pixel to the next
-ROUNDING_STEPS = 2  # of float32 at the far border, by which maps may be off
-Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
-
-
-def of_maps(maps: Maps, width: int, height: int) -> Mask:
-    """Pixels of a resampled image that bilinear interpolation makes of pixels of its source alone.
-
-    At a whole pixel the next one has no weight; one that is beyond by rounding only counts as whole.
-
-    Args:
-        maps: columns and rows of the source, [h, w] each, as `cv2.remap` takes them.
-        width: of the source, pixels.
-        height: of the source, pixels.
-    """
-    inside = np.ones(maps[0].shape, dtype=bool)
-    for part, side in zip(maps, (width, height), strict=True):
-        at, last = part.astype(np.float64), side - 1
-        rounding_px = ROUNDING_STEPS * float(np.spacing(np.float32(last)))
-        inside &= (at >= -rounding_px) & (at <= last + rounding_px)
-    return inside
 
 
 def shrunk(mask: Mask, factor: int) -> Mask:
@@ -63,7 +44,13 @@ def shrunk(mask: Mask, factor: int) -> Mask:
 class BlackBorder:
     """Finds pixels that are black in all images, in large pieces at the border: a vignette or the rim of a lens."""
 
-    def __init__(self) -> None:
+    def __init__(self, maps: Maps | None = None) -> None:
+        """Set up.
+
+        Args:
+            maps: where in the images the pixels of the recording's camera lie; None: they are that camera's.
+        """
+        self._maps = maps
         self._brightest: NDArray[np.uint8] | None = None
         self._images = 0
 
@@ -74,6 +61,8 @@ class BlackBorder:
         image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             return  # reading the recording will complain
+        if self._maps is not None:
+            image = rectified(image, self._maps)
         blue, green, red = image[..., 0], image[..., 1], image[..., 2]
         value = np.maximum(np.maximum(blue, green), red)  # ten times as fast as max(axis=2)
         if np.percentile(value, BRIGHT_PERCENT) > BRIGHT and (

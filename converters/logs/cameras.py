@@ -10,15 +10,16 @@ import numpy as np
 
 from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.layouts.ros_images import size_of
+from duagc.converters.layouts.sound_camera import check_camera
 from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import frame_name, pose_matrix
 from duagc.converters.logs.options import LogOptions
-from duagc.converters.robot_writer import check_camera
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.schemas import topics
 
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
 SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
@@ -97,14 +98,26 @@ class CameraWatch:
             )
 
 
-def is_rectified(topic: str) -> bool:
+def is_rectified(topic: str, own: bool = False) -> bool:
     """Whether images are undistorted, by the name of their topic.
 
     Args:
         topic: of the images.
+        own: whether DUAG-C wrote the log.
     """
     name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
-    return name.startswith(RECTIFIED)
+    return name.startswith(RECTIFIED) or is_own_depth(topic, own)
+
+
+def is_own_depth(topic: str, own: bool) -> bool:
+    """Whether images are depth that belongs to the pinhole camera of color, as DUAG-C writes it.
+
+    Args:
+        topic: of the images.
+        own: whether DUAG-C wrote the log.
+    """
+    row = topics.find(topic) if own else None
+    return row is not None and row[0] is topics.DEPTH
 
 
 def realsense_extrinsics(log: Log, color: str, depth: str, name: str) -> Array | None:
@@ -126,16 +139,21 @@ def realsense_extrinsics(log: Log, color: str, depth: str, name: str) -> Array |
     return found[0] @ se3.inverse(found[1])
 
 
-def stated_unit(log: Log, depth: str, settings: LogOptions) -> LogOptions:
-    """The settings with the unit of depth that a recording by RealSense's own software states, unless they state one.
+def as_stated(log: Log, depth: str, settings: LogOptions, *, own: bool) -> LogOptions:
+    """The settings with what is known of depth by its log, unless they state it.
+
+    That is the unit where RealSense's own software recorded it, and that it is registered where DUAG-C did.
 
     Args:
         log: the log.
         depth: topic of the depth images.
         settings: options of the converter.
+        own: whether DUAG-C wrote the log.
     Raises:
         DuagError: what the log states is no unit.
     """
+    if is_own_depth(depth, own) and settings.registered == "auto":
+        return settings.model_copy(update={"registered": "yes"})
     sensor = depth.removesuffix("/image/data").rpartition("/")[0]
     named = [f"{sensor}/option/Depth{blank}Units/value" for blank in " _"]  # of older and newer software
     found = [topic for topic in log.of_type("std_msgs/msg/Float32") if topic in named]

@@ -15,21 +15,18 @@ from duagc.converters.layouts.derived_depth import (
     STEREO_SCALE_M,
     LidarSource,
     StereoFrames,
-    decoded,
     spread,
 )
 from duagc.converters.layouts.ros_camera import RosCamera
-from duagc.converters.layouts.ros_images import color_bytes
+from duagc.converters.layouts.ros_images import check_decodes, color_bytes
 from duagc.converters.layouts.ros_points import PointTimes
 from duagc.converters.layouts.stereo import RawCamera, StereoRig
-from duagc.converters.layouts.validity import of_maps
 from duagc.converters.logs.files import Log
-from duagc.converters.logs.frames import Transforms
+from duagc.converters.logs.frames import Transforms, body_axes_of_camera
 from duagc.converters.logs.motion import extrinsics_of
 from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import encode_png
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import Mask
@@ -102,26 +99,20 @@ class Sweeps:
 
     scale = 0.001  # no depth image is written
     words = "lidar, drawn on reading"
+    valid: Mask | None = None
     T_color_camera = np.eye(4)
 
     def __init__(
-        self, lidar: LidarSource, camera: RosCamera, undistort: bool, where: tuple[str, str]
+        self, lidar: LidarSource, camera: PinholeCamera, where: tuple[str, str], warnings: Sequence[str] = ()
     ) -> None:
-        """where: of color and points, for the line of an error."""
-        self.lidar, self.camera, self._where = lidar, camera.camera, where
-        self._maps = camera.maps() if undistort else None
-        self.valid = (
-            None if self._maps is None else of_maps(self._maps, self.camera.width, self.camera.height)
-        )
+        """where: of color and points, for the line of an error. warnings: what users should know of it."""
+        self.lidar, self.camera, self._where, self.warnings = lidar, camera, where, warnings
 
     def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
-        import cv2
-
         where = f"{self._where[0]} at {color_ns} ns"
         data, color_format = color_bytes(color, where)
-        if self._maps is not None:
-            image = cv2.remap(decoded(color, where), *self._maps, cv2.INTER_LINEAR)
-            data, color_format = encode_png(np.asarray(image, dtype=np.uint8)), "png"
+        if hasattr(color, "format"):
+            check_decodes(data, where)
         points = self.lidar.points(partner, partner_ns, color_ns, f"{self._where[1]} at {partner_ns} ns")
         return Picture(data, color_format, points_lidar=points)
 
@@ -231,7 +222,16 @@ def sweeps_of(
     some = [entry.read() for entry in islice(log.entries(topic), TIMED_SWEEPS)]
     lidar = LidarSource(T, settings.range_sigma_m, motion, PointTimes.found(some, f"{log.name}: {topic}"))
     where = f"{log.name}: {color[0]}", f"{log.name}: {topic}"
-    return Sweeps(lidar, color[1], settings.undistort, where)
+    warnings = list[str]()
+    if motion is None:
+        warnings.append(
+            "sweeps hold what the LiDAR moved meanwhile; expected --set imu=TOPIC or odometry=TOPIC to take it out"
+        )
+    elif lidar.times.words:
+        warnings.append(f"{topic}: {lidar.times.words}")
+    if not settings.T_color_depth:
+        warnings += body_axes_of_camera(color[1].frame_id, frame, T, "T_color_depth")
+    return Sweeps(lidar, color[1].camera, where, warnings)
 
 
 def some_pairs(pairs: dict[int, int]) -> list[tuple[int, int]]:

@@ -70,4 +70,4 @@ class LogOptions(AssociationOptions, StereoOptions):
     pieces: bool = False
     """All logs of the folder belong to one robot, or to several in different namespaces."""
     undistort: bool = True
-    """Take the distortion out of color."""
+    """Take the distortion out of color, on reading."""

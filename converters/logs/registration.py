@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -16,6 +17,7 @@ from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
 
 SAME_CAMERA = 0.01  # share of focal length and size up to which two cameras agree
 LEAST_BASE_M = 0.001
@@ -60,6 +62,26 @@ def check_infos(color: ImageTopic, depth: ImageTopic, settings: LogOptions, name
         f"{name}: {lost.topic} of {lost.frame!r} has no CameraInfo of its own, found only {color.info} of "
         f"{color.camera.frame_id!r}; expected --set {option}_info=TOPIC or {option}_camera='fx fy cx cy'{registered}"
     )
+
+
+def check_samples(color: PinholeCamera, depth: PinholeCamera, where: str, topic: str) -> None:
+    """Refuse depth that is far coarser than the color that it is to be registered to.
+
+    Args:
+        color: the camera of color.
+        depth: the camera of depth.
+        where: begins the line of an error.
+        topic: of depth.
+    Raises:
+        DuagError: it would be drawn by more samples than registration takes.
+    """
+    steps = sample_steps(depth, color)
+    if steps**2 * depth.width * depth.height > MOST_SAMPLES:
+        finer = max(color.fx / depth.fx, color.fy / depth.fy)
+        most = math.isqrt(MOST_SAMPLES // (depth.width * depth.height)) / 1.5
+        raise DuagError(
+            f"{where} are {finer:.0f} times as fine as those of {topic}, expected at most {most:.0f} times"
+        )
 
 
 def is_named_registered(topic: str) -> bool:

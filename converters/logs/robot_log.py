@@ -2,44 +2,37 @@
 
 from __future__ import annotations
 
-import math
 from array import array
 from collections.abc import Callable, Iterator
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.layouts.ros_images import is_integer_depth, size_of
 from duagc.converters.layouts.tum_layout import Listed, associate, nearest_s
-from duagc.converters.layouts.validity import of_maps
-from duagc.converters.logs.cameras import (
-    CameraWatch,
-    is_rectified,
-    stated,
-    stated_camera,
-    stated_unit,
-)
+from duagc.converters.logs.cameras import CameraWatch, as_stated, is_rectified, stated, stated_camera
 from duagc.converters.logs.choice import Chooser, video_words
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
-from duagc.converters.logs.files import Log
-from duagc.converters.logs.frames import TF_TYPES, Transforms, body_axes_of_camera, frame_name
+from duagc.converters.logs.files import Log, is_own_log
+from duagc.converters.logs.frames import TF_TYPES, Transforms, frame_name
 from duagc.converters.logs.gather import gathered
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader
 from duagc.converters.logs.options import LogOptions
-from duagc.converters.logs.registration import ImageTopic, check_infos, extrinsics
+from duagc.converters.logs.registration import ImageTopic, check_infos, check_samples, extrinsics
 from duagc.converters.logs.stamps import clock_words, sound_stamps
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.lens import Lens, Maps
 from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.recording.pairing import TOLERANCE_NS
-from duagc.pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
 
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 LONGEST_WAIT_S = 60.0  # between color and depth of one clock
@@ -62,6 +55,8 @@ class RobotLog:
         self._rate, self._origin_ns = 0.0, 0  # of the clock, see `settle_drift`
         # by topic of a CameraInfo: the camera of its first message, and whether its images are rectified
         self._cameras: dict[str, tuple[RosCamera, bool]] = {}
+        self._own = any(is_own_log(part.path) for part in log.parts)
+        self._is_rectified = partial(is_rectified, own=self._own)
         self.transforms = Transforms(log, self.namespace, self.warnings)
         self._choose()
 
@@ -74,7 +69,7 @@ class RobotLog:
             raise DuagError(f"{self.name}: found no topic of images{where}, expected color and depth{video}")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
-        self.settings = s = stated_unit(self.log, self.depth, s)
+        self.settings = s = as_stated(self.log, self.depth, s, own=self._own)
         color = self._view(self.color, "color_info", chooser)
         self.color_camera = color.camera
         self._motion = MotionReader(
@@ -94,14 +89,8 @@ class RobotLog:
         sensor = self.depth_camera.camera
         if self._is_depth_rectified:
             self.camera = sensor
-        steps = sample_steps(sensor, self.camera)
-        if self.T_color_depth is not None and steps**2 * sensor.width * sensor.height > MOST_SAMPLES:
-            finer = max(self.camera.fx / sensor.fx, self.camera.fy / sensor.fy)
-            most = math.isqrt(MOST_SAMPLES // (sensor.width * sensor.height)) / 1.5
-            raise DuagError(
-                f"{self.name}: pixels of {self.color} are {finer:.0f} times as fine as those of {self.depth}, expected "
-                f"at most {most:.0f} times"
-            )
+        if self.T_color_depth is not None:
+            check_samples(self.camera, sensor, f"{self.name}: pixels of {self.color}", self.depth)
         self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
         self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE
 
@@ -113,28 +102,28 @@ class RobotLog:
             check_infos(color, right, s, self.name)
             eyes = [(view.topic, view.info, view.camera) for view in (color, right)]
             return stereo_of(
-                self.log, eyes[0], eyes[1], is_rectified(self.color), transforms=self.transforms, settings=s
+                self.log,
+                eyes[0],
+                eyes[1],
+                self._is_rectified(self.color),
+                transforms=self.transforms,
+                settings=s,
             )
         if s.max_difference_s == 0:
             self.settings = s.model_copy(update={"max_difference_s": HALF_TURN_S})
         motion = self.odometry.prior() if self.odometry else self.imu.prior() if self.imu else None
-        if motion is None:
-            self.warnings.append(
-                "sweeps hold what the LiDAR moved meanwhile; expected --set imu=TOPIC or odometry=TOPIC to take it out"
-            )
-        camera, frame = (self.color, self.color_camera), self.log.first(self.depth).header.frame_id
+        camera = self.color, self.color_camera
         sweeps = sweeps_of(self.log, camera, self.depth, self.transforms, motion=motion, settings=s)
-        if motion is not None and sweeps.lidar.times.words:
-            self.warnings.append(f"{self.depth}: {sweeps.lidar.times.words}")
-        if not s.T_color_depth:
-            T = sweeps.lidar.T_camera_lidar
-            self.warnings += body_axes_of_camera(self.color_camera.frame_id, frame, T, "T_color_depth")
+        self.warnings += sweeps.warnings
         return sweeps
 
     @property
     def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
         """Where the camera of the recording is in the color camera: turned, if that is rectified."""
-        return self.derived.T_color_camera if self.derived else np.eye(4)
+        if self.derived:
+            return self.derived.T_color_camera
+        lens = self.lens
+        return np.eye(4) if lens is None else se3.from_rotation_translation(lens.rotation(), np.zeros(3))
 
     def depth_m(self, picture: Picture) -> Array:
         """Depth [h, w] of a picture in meters, 0 = none."""
@@ -160,11 +149,11 @@ class RobotLog:
             return ImageTopic(topic, frame, "", stated_camera(text, image, where))
         chosen = chooser.info(option, topic).required(self.log, option)
         try:
-            camera = RosCamera.of(self.log.first(chosen), is_rectified(topic), f"{self.name}: {chosen}")
+            camera = RosCamera.of(self.log.first(chosen), self._is_rectified(topic), f"{self.name}: {chosen}")
         except DuagError as error:
             option = option.removesuffix("_info")
             raise DuagError(f"{error}, or --set {option}_camera='fx fy cx cy'") from error
-        self._cameras[chosen] = (camera, is_rectified(topic))
+        self._cameras[chosen] = (camera, self._is_rectified(topic))
         found = size_of(image, where)
         expected = camera.camera.width, camera.camera.height
         if found != expected:
@@ -173,29 +162,34 @@ class RobotLog:
             )
         return ImageTopic(topic, frame, chosen, camera)
 
-    @cached_property
-    def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Where in the color images every pixel of the recording's camera lies."""
-        onto = self.camera if self._is_depth_rectified else None
-        return self.color_camera.maps(onto) if self.settings.undistort else None
+    @property
+    def lens(self) -> Lens | None:
+        """With which the color images were taken that the recording keeps; None: by its camera."""
+        lens = self.color_camera.lens
+        if lens is None or not self.settings.undistort or isinstance(self.derived, Stereo):
+            return None
+        return (
+            replace(lens, rotation_rad=self.color_camera.rotation_rad) if self._is_depth_rectified else lens
+        )
 
     @cached_property
     def _is_depth_rectified(self) -> bool:
         """Whether depth is registered to color as it looks without distortion, while color is recorded with it."""
         registered = self.derived is None and self.T_color_depth is None and self.settings.undistort
         stated_so = self._has_own_info and self.depth_camera.is_straight
-        return registered and (is_rectified(self.depth) or stated_so) and bool(self.color_camera.distortion)
+        return (
+            registered
+            and (self._is_rectified(self.depth) or stated_so)
+            and bool(self.color_camera.distortion)
+        )
 
-    @cached_property
+    @property
     def valid(self) -> Mask | None:
-        """Pixels of the recording's images that show the scene; None: all."""
-        if self.derived is not None:
-            return self.derived.valid
-        maps, camera = self.color_maps, self.color_camera.camera
-        return None if maps is None else of_maps(maps, camera.width, camera.height)
+        """Pixels of images that were resampled here that show the scene; None: all."""
+        return None if self.derived is None else self.derived.valid
 
     @cached_property
-    def depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    def depth_maps(self) -> Maps | None:
         """Where in the depth images every pixel of their pinhole lies; None if they need not be undistorted.
 
         Depth that is registered has the distortion of color, unless it is rectified or color is; that of another camera
@@ -205,7 +199,9 @@ class RobotLog:
             return None
         if self.T_color_depth is None and self._has_own_info and not self.color_camera.distortion:
             return self.depth_camera.maps(self.camera)
-        return self.color_maps if self.T_color_depth is None else self.depth_camera.maps()
+        if self.T_color_depth is not None:
+            return self.depth_camera.maps()
+        return None if self.lens is None else self.lens.maps(self.camera)
 
     # --- what moved
 

@@ -23,7 +23,7 @@ from duagc.converters.simulate.render.raycast import MeshRenderer
 from duagc.converters.simulate.render.renderer import CameraRenderer, RenderedView
 from duagc.converters.simulate.sensors import noise
 from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
-from duagc.converters.simulate.sensors.lens import Lens
+from duagc.converters.simulate.sensors.lens import RadialLens
 from duagc.converters.simulate.sensors.light import vignette, with_light
 from duagc.converters.simulate.sensors.rig import BASELINE_M, MovingCamera, Rig, with_gain
 from duagc.converters.simulate.settings import Cover, SimulationSettings
@@ -99,10 +99,10 @@ class FrameSettings:
     degradations: Degradations
 
     @property
-    def lens(self) -> Lens | None:
+    def lens(self) -> RadialLens | None:
         """The lens of the camera; None: a pinhole."""
         k1 = self.degradations.lens_k1
-        return Lens(self.camera, k1) if k1 != 0 else None
+        return RadialLens(self.camera, k1) if k1 != 0 else None
 
     @classmethod
     def of(
@@ -244,7 +244,7 @@ class FrameRenderer:
 class _Undistortion:
     """Images of a lens as a converter would write them: of a pinhole camera, with a rim that the lens did not see."""
 
-    def __init__(self, lens: Lens, renderer: CameraRenderer) -> None:
+    def __init__(self, lens: RadialLens, renderer: CameraRenderer) -> None:
         self._u, self._v, self.mask = lens.maps()
         self._renderer = renderer
 

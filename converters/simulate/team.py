@@ -13,7 +13,7 @@ from duagc.converters.simulate.ply import write_points
 from duagc.converters.simulate.preview import Preview
 from duagc.converters.simulate.sensors import light, shutter
 from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
-from duagc.converters.simulate.sensors.lens import Lens
+from duagc.converters.simulate.sensors.lens import RadialLens
 from duagc.converters.simulate.sensors.rig import RANGE_SIGMA_M, T_CAMERA_LIDAR, Rig
 from duagc.converters.simulate.settings import SCENES, Cover, SimulationSettings, camera_of, scene_of
 from duagc.converters.simulate.simulated_scenes import SimulatedMeshes, SimulatedScene, set_up
@@ -311,7 +311,7 @@ class _Team:
         """
         rig = self.rig
         k1 = self.settings.degradations.lens_k1
-        lens = Lens(self.camera, k1) if k1 != 0 else None
+        lens = RadialLens(self.camera, k1) if k1 != 0 else None
         sensors = _log_metadata(rig, self.settings, lens)
         camera = self.camera if lens is None else lens.pinhole
         for name, path in zip(self.names, self.trajectories, strict=True):
@@ -372,7 +372,7 @@ def _check_output(out: Path, workers: int, preview: Path | None) -> None:
         )
 
 
-def _log_metadata(rig: Rig, settings: SimulationSettings, lens: Lens | None) -> dict[str, str]:
+def _log_metadata(rig: Rig, settings: SimulationSettings, lens: RadialLens | None) -> dict[str, str]:
     """What a log says about its sensors, as far as a camera's maker states it; the readout is of undistorted images."""
     metadata = {"depth_noise": settings.noise} if rig.sensor == "rgbd" else {"depth": rig.sensor}
     if rig.readout_s > 0:

@@ -13,7 +13,10 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, encode_png
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import FISHEYE_NUMBERS, POLYNOMIAL_NUMBERS, Lens
 from duagc.pipeline.messages.parts import camera_frame, numbers, pack_array, pack_stamp, unpack_array
+
+PLUMB_BOB, RATIONAL, FISHEYE = "plumb_bob", "rational_polynomial", "kannala_brandt"  # as Foxglove calls them
 
 
 def _foxglove(name: str, stamp_ns: int, frame_id: str, **fields: Any) -> Any:
@@ -95,36 +98,90 @@ def unpack_valid(m: Any, where: str) -> NDArray[np.bool_]:
     return np.asarray(image == 255)
 
 
-def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera) -> Any:
-    """foxglove.CameraCalibration of an undistorted camera."""
-    K = camera.matrix()
+def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera, lens: Lens | None = None) -> Any:
+    """foxglove.CameraCalibration, as ROS has it: K and D of the images, P of the pinhole camera that they are seen by.
+
+    Args:
+        stamp_ns: time of the message.
+        robot: whose camera it is.
+        camera: the pinhole camera.
+        lens: of the images, which are as large as those of the pinhole camera; None: they are its own.
+    """
+    source = camera if lens is None else lens.source
+    if (source.width, source.height) != (camera.width, camera.height):
+        raise ValueError(f"images of {source} are to be seen by {camera}, expected the same size")
+    fields: dict[str, Any] = {}
+    if lens is not None and lens.distortion:
+        # the polynomial of fewer numbers is that whose other numbers are 0
+        numbers_of = max(5, len(lens.distortion)) if not lens.fisheye else len(lens.distortion)
+        coefficients = [*lens.distortion, *(0.0,) * (numbers_of - len(lens.distortion))]
+        model = FISHEYE if lens.fisheye else PLUMB_BOB if numbers_of == 5 else RATIONAL
+        fields = {"distortion_model": model, "D": coefficients}
+    turn = np.eye(3) if lens is None else lens.rotation().T
     return _foxglove(
         "CameraCalibration",
         stamp_ns,
         camera_frame(robot),
         width=camera.width,
         height=camera.height,
-        K=K.ravel().tolist(),
-        R=np.eye(3).ravel().tolist(),
-        P=np.hstack([K, np.zeros((3, 1))]).ravel().tolist(),
+        K=source.matrix().ravel().tolist(),
+        R=turn.ravel().tolist(),
+        P=np.hstack([camera.matrix(), np.zeros((3, 1))]).ravel().tolist(),
+        **fields,
     )
 
 
 def unpack_calibration(m: Any) -> PinholeCamera:
-    """Camera of a foxglove.CameraCalibration.
+    """Camera of a foxglove.CameraCalibration whose images have no distortion.
 
     Raises:
         DuagError: lens distortion, numbers that are not finite, or no image size.
     """
-    K = numbers(m.K, (3, 3), "K")
-    if any(d != 0 for d in m.D):
+    camera, lens = unpack_camera(m)
+    if lens is not None:
         raise DuagError(
             f"found lens distortion {m.distortion_model!r} {list(m.D)}, expected undistorted images"
         )
+    return camera
+
+
+def unpack_camera(m: Any) -> tuple[PinholeCamera, Lens | None]:
+    """The pinhole camera of a foxglove.CameraCalibration, and the lens of its images.
+
+    Returns:
+        The camera by whose pixels images are read, and how they were taken; None: by this camera.
+
+    Raises:
+        DuagError: an unknown distortion, numbers that are not finite, or no image size.
+    """
+    source = _pinhole(m, numbers(m.K, (3, 3), "K"), "K")
+    turn = numbers(m.R, (3, 3), "R") if any(m.R) else np.eye(3)
+    if not np.any(m.D) and np.array_equal(turn, np.eye(3)):
+        return source, None
+    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6 or np.linalg.det(turn) < 0:
+        raise DuagError(f"R is {turn.ravel().tolist()}, expected a rotation")
+    P = numbers(m.P, (3, 4), "P")
+    if np.any(P[:, 3]):
+        raise DuagError(f"P is {P.ravel().tolist()}, expected a camera at the place of K")
+    D, fisheye = tuple(float(d) for d in m.D), m.distortion_model == FISHEYE
+    lengths = FISHEYE_NUMBERS if fisheye else POLYNOMIAL_NUMBERS
+    known = m.distortion_model in (FISHEYE, PLUMB_BOB, RATIONAL) and len(D) in lengths
+    if any(D) and not (known and np.isfinite(D).all()):
+        raise DuagError(
+            f"found lens distortion {m.distortion_model!r} {list(D)}, expected {PLUMB_BOB!r}, {RATIONAL!r} or "
+            f"{FISHEYE!r} and finite numbers as OpenCV has them"
+        )
+    x, y, z = so3.log(turn.T).tolist()
+    lens = Lens(source, D if any(D) else (), fisheye and any(D), (x, y, z))
+    return _pinhole(m, P[:, :3], "P"), lens
+
+
+def _pinhole(m: Any, K: Array, name: str) -> PinholeCamera:
+    """The camera of a matrix [3, 3] of a foxglove.CameraCalibration."""
     if not np.all(np.isfinite(K)) or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise DuagError(f"K is {K.ravel().tolist()}, expected finite numbers and positive focal lengths")
+        raise DuagError(f"{name} is {K.ravel().tolist()}, expected finite numbers and positive focal lengths")
     if K[0, 1] != 0 or not np.array_equal(np.delete(K.ravel(), [0, 1, 2, 4, 5]), [0, 0, 0, 1]):
-        raise DuagError(f"K is {K.ravel().tolist()}, expected a camera without skew")
+        raise DuagError(f"{name} is {K.ravel().tolist()}, expected a camera without skew")
     if m.width == 0 or m.height == 0:
         raise DuagError(f"image size is {m.width}x{m.height}, expected at least one pixel")
     return PinholeCamera(m.width, m.height, *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))

@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import MAX_SIDE_PX, PinholeCamera
+from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.geometry.open_shutter import OpenShutter
 from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording.color_images import ColorImages
 from duagc.pipeline.recording.depth_sources import DepthImage, check_size, constant, depth_source
 from duagc.pipeline.recording.motion import MotionPrior, motion_prior
 from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, move_depth, tracked_frames
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
-from duagc.pipeline.recording.read import LOG_RECORD, LogFile, Record
+from duagc.pipeline.recording.read import LOG_RECORD, LogFile
 from duagc.pipeline.recording.rgbd_frame import RgbdFrame
 from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, unrollings
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
@@ -54,9 +55,10 @@ class RgbdLog:
     camera, or a LiDAR's (`depth_sources`). Masks belong to the color image of the same publish time; `valid` belongs
     to all of them.
 
-    `robot`, `camera`, `depth_scale` (meters per unit), `valid` (bool [H, W], pixels that show the scene; None = all),
-    `depth_delay_ns` (of `delay_depth`), `readout` (how long images are read, as stated or found), `stated_shutter_s`
-    (how long the shutter is open, seconds, if it states that), `shutter` (of `open_shutter`). Keeps few frames.
+    `robot`, `camera`, `lens` (with which its images were taken; None = by the camera), `depth_scale` (meters per unit),
+    `valid` (bool [H, W], pixels that show the scene; None = all), `depth_delay_ns` (of `delay_depth`), `readout` (how
+    long images are read, as stated or found), `stated_shutter_s` (how long the shutter is open, seconds, if it states
+    that), `shutter` (of `open_shutter`). Keeps few frames.
     """
 
     def __init__(self, path: Path) -> None:
@@ -85,7 +87,8 @@ class RgbdLog:
         self._color_topic = topic_table.COLOR.of(self.robot)
         if not self._log.entries(self._color_topic):
             raise DuagError(f"{self.path}: {self._color_topic} has no message, expected images")
-        self.camera = self._read_camera()
+        self.camera, self.lens = self._read_camera()
+        self._images = ColorImages(self.camera, self.lens)
         self.valid = self._read_valid()
         self._source = depth_source(self._log, self.robot, self.camera)
         self.depth_scale = self._source.scale
@@ -108,9 +111,9 @@ class RgbdLog:
             )
         self._mask_at = self._read_mask_times()
 
-    def _read_camera(self) -> PinholeCamera:
+    def _read_camera(self) -> tuple[PinholeCamera, Lens | None]:
         topic = topic_table.CALIBRATION.of(self.robot)
-        camera = constant(self._log, topic, messages.unpack_calibration)
+        camera, lens = constant(self._log, topic, messages.unpack_camera)
         if max(camera.width, camera.height) > MAX_SIDE_PX:
             raise DuagError(
                 f"{self.path}: {topic} says {camera.width} x {camera.height} px, expected sides up to {MAX_SIDE_PX}"
@@ -120,7 +123,7 @@ class RgbdLog:
             raise DuagError(
                 f"{self.path}: {topic} begins at {first} ns, expected no later than the images ({image} ns)"
             )
-        return camera
+        return camera, lens
 
     def _read_valid(self) -> NDArray[np.bool_] | None:
         """Pixels that show the scene in all images, by all messages about it; None: all pixels.
@@ -266,7 +269,7 @@ class RgbdLog:
             IndexError: there are fewer frames.
         """
         stamp, depth_stamp = self._stamps(index)
-        image = self._decode_color(self._log.record_at(self._color_topic, self._color_at[stamp]))
+        image = self._images.decode(self._log.record_at(self._color_topic, self._color_at[stamp]))
         readout, shutter = self.readout if still else Readout(), self.shutter if depth else None
         geometry = self._geometry(stamp, depth_stamp, readout, with_depth=depth)
         mask, found = geometry.mask, geometry.depth
@@ -363,17 +366,6 @@ class RgbdLog:
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [H, W] with 0 where the camera never shows the scene."""
         return values if self.valid is None else np.where(self.valid, values, np.float32(0))
-
-    def _decode_color(self, record: Record) -> NDArray[np.uint8]:
-        import cv2
-
-        data = record.proto().data
-        image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            where = f"{self.path}: {record.topic} at {record.publish_time_ns} ns"
-            raise DuagError(f"{where} has {len(data)} bytes that no decoder reads, expected JPEG or PNG")
-        check_size(record, image.shape[1], image.shape[0], self.camera)
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def _mask_of(self, stamp_ns: int) -> NDArray[np.bool_] | None:
         entry = self._mask_at.get(stamp_ns)

@@ -1,7 +1,8 @@
 """Runs and recordings in Rerun. The only module that imports it; what it writes is no part of a digest.
 
 A run is logged piece by piece (`write_rrd`). A recording opens in Rerun as it is; `recording_to_rrd` adds what the
-viewer does not derive by itself: depth images with their unit, and names of frames that hang together.
+viewer does not derive by itself: depth images with their unit, names of frames that hang together, and color without
+the distortion of its lens.
 """
 
 from __future__ import annotations
@@ -12,23 +13,27 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from duagc.pipeline.messages import camera_frame
-from duagc.pipeline.recording import RECORDING_FILE, Recording, open_rgbd
+from duagc.pipeline.recording import RECORDING_FILE, Recording, open_rgbd, read_log
+from duagc.pipeline.recording.color_images import ColorImages
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.schemas import topics
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
+    from rerun.chunk import Chunk
 from duagc.pipeline.viewing.rrd_file import written
 from duagc.pipeline.viewing.run_rrd import APPLICATION, closed_panels, write_rrd
 
-LOG_TIME = "message_log_time"  # timeline that Rerun gives to a log
+LOG_TIME, PUBLISH_TIME = "message_log_time", "message_publish_time"  # timelines that Rerun gives to a log
 
 
 VIEWER_MEMORY = "4GiB"
@@ -100,7 +105,13 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
         with open_rgbd(path) as log:
             robots.append(log.robot)
             topic, units_per_meter = topics.DEPTH.of(log.robot), 1.0 / log.depth_scale
+            camera, lens = log.camera, log.lens
         depth, rest = McapReader(path).stream().split(content=topic)
+        if lens is not None:
+            rest = rest.drop(content=topics.COLOR.of(robots[-1]))
+            streams.append(
+                LazyChunkStream.from_iter(_rectified_color(path, robots[-1], ColorImages(camera, lens)))
+            )
         meter = Chunk.from_columns(topic, indexes=[], columns=rr.DepthImage.columns(meter=[units_per_meter]))
         streams += [
             depth.lenses(lenses, output_mode="forward_unmatched"),
@@ -111,6 +122,27 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
     with written(recording, _recording_blueprint(robots), out):
         recording.send_chunks(LazyChunkStream.merge(*streams))
     return out
+
+
+def _rectified_color(path: Path, robot: str, images: ColorImages) -> Iterator[Chunk]:
+    """Color of a log whose images have a lens, which Rerun does not take out, where and when Rerun has the others."""
+    import cv2
+    import rerun as rr
+    from rerun.chunk import Chunk
+
+    for record in read_log(path, [topics.COLOR]):
+        _, data = cv2.imencode(".jpg", images.decode(record)[:, :, ::-1])
+        times = {LOG_TIME: record.log_time_ns, PUBLISH_TIME: record.publish_time_ns}
+        yield Chunk.from_columns(
+            record.topic,
+            indexes=[
+                rr.TimeColumn(name, timestamp=[np.datetime64(time, "ns")]) for name, time in times.items()
+            ],
+            columns=[
+                *rr.EncodedImage.columns(blob=[data.tobytes()], media_type=["image/jpeg"]),
+                *rr.CoordinateFrame.columns(frame=[f"{camera_frame(robot)}_image_plane"]),
+            ],
+        )
 
 
 def _recording_blueprint(robots: Sequence[str]) -> rrb.Blueprint:

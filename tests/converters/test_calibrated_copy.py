@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from duagc.converters.calibrated_copy import Correction, why_not, write_calibrated
-from duagc.converters.layouts.calibrated import ColorLens
 from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline import messages
@@ -18,6 +17,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry import depth_error, se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.recording import LogWriter, Recording, RgbdFrame, open_rgbd, read_log
 from duagc.pipeline.recording.read import LogFile, content_digest
 from duagc.schemas import topics
@@ -26,7 +26,7 @@ CAMERA = PinholeCamera(160, 120, 140.0, 142.0, 79.0, 60.5)
 SEEN_BY = PinholeCamera(160, 120, 146.0, 147.0, 81.5, 58.5)
 TURN = (0.010, -0.014, 0.02)
 CORRECTION = Correction(
-    ColorLens(SEEN_BY, (0.08, -0.3, 0.0, 0.0, 0.3), TURN),
+    Lens(SEEN_BY, (0.08, -0.3, 0.0, 0.0, 0.3), rotation_rad=TURN),
     (0.012, -0.015, 0.006, -0.018, 0.005, 0.008),
     4_000_000,
 )
@@ -181,7 +181,7 @@ def test_everything_else_is_copied(recorded: Recording, corrected: Recording) ->
         assert same is not None
         assert same.read_bytes() == truth.read_bytes()
     assert corrected.log("bravo").read_bytes() == recorded.log("bravo").read_bytes()
-    for row in (topics.IMU, topics.IMU_TRANSFORM, topics.CALIBRATION):
+    for row in (topics.IMU, topics.IMU_TRANSFORM, topics.COLOR):
         was, now = (list(read_log(r.log("alpha"), [row])) for r in (recorded, corrected))
         assert was
         assert [dataclasses.replace(r, path=Path()) for r in was] == [

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from duagc import schemas
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.splat.gaussians import Gaussians
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -190,6 +191,66 @@ def test_other_depth_is_refused(change: dict[str, Any], words: str) -> None:
         setattr(message, name, value)
     with pytest.raises(DuagError, match=words):
         m.unpack_depth(message, "here")
+
+
+CAMERA = PinholeCamera(7, 5, 3.5, 3.25, 2.9, 2.1)
+
+
+@pytest.mark.parametrize(
+    ("lens", "model"),
+    [
+        (Lens(CAMERA, (0.1, -0.2, 0.003, 0.004, 0.05)), "plumb_bob"),
+        (Lens(PinholeCamera(7, 5, 4.0, 3.0, 3.0, 2.0), (0.1, -0.2, 0.0, 0.0)), "plumb_bob"),
+        (Lens(CAMERA, (0.1, -0.2, 0.0, 0.0, 0.3, 0.4, 0.5, 0.6)), "rational_polynomial"),
+        (Lens(CAMERA, (0.1, -0.2, 0.0, 0.0), fisheye=True), "kannala_brandt"),
+        (Lens(CAMERA, (), rotation_rad=(0.01, -0.02, 0.03)), ""),
+    ],
+)
+def test_a_lens_is_stated_as_ros_does_and_reads_back(lens: Lens, model: str) -> None:
+    """K and D are of the images, P of the pinhole camera that they are seen by, turned by R."""
+    message = m.pack_calibration(5, "alpha", CAMERA, lens)
+    assert message.distortion_model == model
+    assert list(message.K) == lens.source.matrix().ravel().tolist()
+    assert np.reshape(message.P, (3, 4))[:, :3].tolist() == CAMERA.matrix().tolist()
+    turned = np.reshape(message.R, (3, 3)) @ so3.exp(np.array(lens.rotation_rad))
+    np.testing.assert_allclose(turned, np.eye(3), atol=1e-15)
+    camera, found = m.unpack_camera(message)
+    assert camera == CAMERA
+    assert found is not None
+    assert (found.source, found.fisheye) == (lens.source, lens.fisheye)
+    assert found.distortion[: len(lens.distortion)] == lens.distortion
+    assert not any(found.distortion[len(lens.distortion) :])
+    np.testing.assert_allclose(found.rotation_rad, lens.rotation_rad, atol=1e-15)
+    with pytest.raises(DuagError, match="expected undistorted images"):
+        m.unpack_calibration(message)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"distortion_model": "unified"}, "'unified'.*expected 'plumb_bob'"),
+        ({"D": [0.1, 0.2]}, "expected 'plumb_bob'"),
+        ({"D": [np.nan, 0, 0, 0, 0]}, "finite"),
+        ({"R": [2.0, 0, 0, 0, 1, 0, 0, 0, 1]}, "expected a rotation"),
+        ({"R": [1.0]}, "R has 1 numbers"),
+        ({"P": [0.0] * 12}, "P is .*positive focal"),
+        ({"P": [1.0, 0, 1, -3, 0, 1, 1, 0, 0, 0, 1, 0]}, "at the place of K"),
+    ],
+)
+def test_a_lens_that_says_something_else_is_refused(change: dict[str, Any], words: str) -> None:
+    message = m.pack_calibration(5, "alpha", CAMERA, Lens(CAMERA, (0.1, -0.2, 0.0, 0.0, 0.3)))
+    for name, value in change.items():
+        if name == "distortion_model":
+            message.distortion_model = value
+        else:
+            getattr(message, name)[:] = value
+    with pytest.raises(DuagError, match=words):
+        m.unpack_camera(message)
+
+
+def test_images_of_another_size_than_the_camera_are_a_bug() -> None:
+    with pytest.raises(ValueError, match="same size"):
+        m.pack_calibration(5, "alpha", CAMERA, Lens(CAMERA.halved(), (0.1,) * 5))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +13,7 @@ from duagc.converters.writer import RecordingWriter
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens, seen_by_source
 from duagc.pipeline.recording import LogWriter, info, open_rgbd
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.schemas import topics
@@ -166,6 +168,28 @@ def test_images_without_a_partner(tmp_path: Path) -> None:
         assert log.pairing.depth_alone == ()
     warnings = info(path)["warnings"]
     assert f"{COLOR}: 5 images have none of {DEPTH} within 100 ms: no depth" in warnings
+
+
+def test_color_of_a_lens_is_seen_by_the_pinhole_camera_that_the_log_states(tmp_path: Path) -> None:
+    """The log holds the camera's own bytes; depth and masks are of the pinhole camera already."""
+    lens = Lens(CAMERA, (0.3, -0.1, 0.01, 0.0, 0.0))
+    path = tmp_path / "alpha.mcap"
+    with LogWriter(path, "alpha") as log:
+        log.channel(DEPTH, topics.DEPTH.schema, {"depth_scale": "0.001"})
+        log.write(CALIBRATION, m.pack_calibration(0, "alpha", CAMERA, lens), 0)
+        log.write(COLOR, m.pack_color(0, "alpha", png(image(0)), "png"), 0)
+        log.write(DEPTH, m.pack_depth(0, "alpha", depth(0)), 0)
+    with open_rgbd(path) as log:
+        assert (log.camera, log.lens) == (CAMERA, lens)
+        frame = log.frame(0)
+    K, size = CAMERA.matrix(), (CAMERA.width, CAMERA.height)
+    maps = cv2.initUndistortRectifyMap(K, np.array(lens.distortion), np.eye(3), K, size, cv2.CV_32FC1)
+    straight = cv2.remap(image(0), *maps, cv2.INTER_LINEAR)
+    inside = seen_by_source(lens.maps(CAMERA), CAMERA.width, CAMERA.height)
+    assert 0.3 < inside.mean() < 1
+    assert np.abs(frame.color[inside].astype(int) - straight[inside][:, ::-1]).max() <= 2
+    assert not np.array_equal(frame.color, image(0)[:, :, ::-1])
+    assert np.array_equal(frame.depth, depth(0) * np.float32(0.001))
 
 
 def test_color_and_depth_may_come_at_their_own_rates(tmp_path: Path) -> None:

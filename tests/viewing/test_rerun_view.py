@@ -2,11 +2,16 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens
+from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.viewing import rerun_view, run_rrd
 from tests.fixtures.fake_run import FRAMES, KEYFRAMES, FakeRun, make, wall
@@ -62,6 +67,35 @@ def test_a_recording_becomes_a_file_with_depth_in_meters(fake, tmp_path):
         assert "Image:buffer" not in depth
         assert found[f"/{robot}/camera/color"]["EncodedImage:blob"] == FRAMES
     assert [p.name for p in tmp_path.iterdir()] == ["recording.rrd"]
+
+
+def test_color_of_a_lens_is_shown_as_the_pinhole_camera_sees_it(tmp_path):
+    """Rerun shows images as they are, and depth next to them has no distortion."""
+    from rerun.chunk import RrdReader
+
+    camera = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    u, v = np.meshgrid(np.arange(64.0), np.arange(48.0))
+    waves = np.rint(127 + 100 * np.stack([np.sin(u / 4), np.cos(v / 4), np.sin((u + v) / 6)], axis=-1))
+    _, data = cv2.imencode(".png", waves.astype(np.uint8))
+    with RobotWriter(tmp_path, "alpha", camera, 0.001) as robot:
+        robot.set_lens(Lens(camera, (0.4, 0.0, 0.0, 0.0, 0.0)))
+        for k in range(3):
+            robot.add_frame(k * 10**8, data.tobytes(), "png", np.full((48, 64), 1000, np.uint16))
+    out = rerun_view.recording_to_rrd([tmp_path / "alpha.mcap"], tmp_path / "lens.rrd")
+    assert of_rrd(out)["/alpha/camera/color"]["EncodedImage:blob"] == 3
+    rows = [
+        chunk.to_record_batch().to_pydict()
+        for chunk in RrdReader(out).stream().to_chunks()
+        if chunk.entity_path == "/alpha/camera/color"
+    ]
+    with open_rgbd(tmp_path / "alpha.mcap") as log:
+        expected, seen = log.frame(1).color, log.valid
+    assert seen is not None
+    for row in rows:
+        blob = bytes(row["EncodedImage:blob"][0][0])
+        shown = cv2.imdecode(np.frombuffer(blob, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+        assert np.abs(shown.astype(int) - expected)[seen].mean() < 4
+    assert np.abs(waves[:, :, ::-1] - expected)[seen].mean() > 10
 
 
 @pytest.mark.parametrize("shown", ["run", "recording"])

@@ -16,7 +16,7 @@ NEWTON_STEPS = 30
 
 
 @dataclass(frozen=True)
-class Lens:
+class RadialLens:
     """A camera with a lens.
 
     Attributes:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from duagc.converters.simulate.movers import Mover
 from duagc.converters.simulate.render.raycast import OFFSETS, MeshRenderer
 from duagc.converters.simulate.render.renderer import RenderedView
-from duagc.converters.simulate.sensors.lens import Lens
+from duagc.converters.simulate.sensors.lens import RadialLens
 from duagc.converters.simulate.trajectories.moments import pose_at
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
@@ -97,7 +97,7 @@ class MovingCamera:
         rig: Rig,
         movers: list[Mover],
         *,
-        lens: Lens | None = None,
+        lens: RadialLens | None = None,
         blur_px: float = 0.0,
     ) -> None:
         """Initialize.

@@ -96,6 +96,24 @@ def test_lossless_is_lossless(made: dict[str, tuple[Path, Path]], name: str) -> 
     assert np.array_equal(stored, cv2.imread(str(depth_file), cv2.IMREAD_UNCHANGED))
 
 
+@pytest.mark.parametrize("name", ["tum", "bonn"])
+def test_images_with_distortion_are_kept_and_seen_without_it(
+    made: dict[str, tuple[Path, Path]], name: str
+) -> None:
+    src, recording = made[name]
+    files = sorted(src.rglob("rgb/*.png"))
+    stored = [r.proto() for r in read_log(recording / "alpha.mcap", topics=[topics.COLOR.of("alpha")])]
+    assert [image.data for image in stored] == [file.read_bytes() for file in files[: len(stored)]]
+    with open_rgbd(recording / "alpha.mcap") as log:
+        assert log.lens is not None
+        assert log.valid is not None
+        K, lens, frame = log.camera.matrix(), np.array(log.lens.distortion), log.frame(0)
+        size = log.camera.width, log.camera.height
+        maps = cv2.initUndistortRectifyMap(K, lens, np.eye(3), K, size, cv2.CV_32FC1)
+        straight = cv2.remap(cv2.imread(str(files[0])), *maps, cv2.INTER_LINEAR)[:, :, ::-1]
+        assert np.abs(frame.color.astype(int) - straight)[log.valid].max() <= 1
+
+
 def test_times_and_warnings(made: dict[str, tuple[Path, Path]]) -> None:
     def stated(name: str) -> str:
         return " ".join(json.loads((made[name][1] / "recording.json").read_text())["warnings"])

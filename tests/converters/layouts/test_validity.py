@@ -19,6 +19,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import seen_by_source
 from duagc.pipeline.recording import open_rgbd, read_log
 from duagc.schemas import topics
 from tests.fixtures.image_folders import make_tum_files
@@ -37,7 +38,7 @@ def test_a_valid_pixel_does_not_depend_on_what_is_beyond_the_border(seed: int, k
     maps = np.ascontiguousarray(u), np.ascontiguousarray(v)
     image = np.random.default_rng(seed).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     black, white = (cv2.remap(image, *maps, cv2.INTER_LINEAR, borderValue=(c, c, c)) for c in (0, 255))
-    valid = validity.of_maps(maps, 64, 48)
+    valid = seen_by_source(maps, 64, 48)
     assert np.abs(black[valid].astype(int) - white[valid]).max() <= (1 if abs(k1) < 1e-4 else 0)
     # and hardly a pixel is left out that does not depend on it, because its share is less than one gray value
     if abs(k1) > 0.01:

@@ -14,10 +14,12 @@ from mcap.writer import CompressionType, IndexType
 
 from duagc.converters import registry
 from duagc.converters.logs import open_log
+from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks.check import check
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.recording import open_rgbd, read_log
 from tests.fixtures.foreign_mcap import Row, digests, raw_log, write
 from tests.fixtures.ros_bags import Ros, scene
@@ -109,6 +111,30 @@ def test_transforms_that_never_change_are_extrinsics(tmp_path: Path, expected: d
         registry.convert("ros", path, tmp_path / "rec3")
 
 
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.03, -0.02, 0.05)])
+def test_a_log_of_ours_with_a_lens_is_read_as_it_is(tmp_path: Path, turn: tuple[float, float, float]) -> None:
+    """Its color has the distortion, its depth has none: registered depth of others has that of color."""
+    camera = PinholeCamera(64, 48, 50.0, 51.0, 31.0, 23.0)
+    lens = Lens(PinholeCamera(64, 48, 52.0, 50.0, 32.0, 24.0), (-0.3, 0.1, 0.0, 0.0, 0.0), rotation_rad=turn)
+    (tmp_path / "ours").mkdir()
+    rng = np.random.default_rng(0)
+    with RobotWriter(tmp_path / "ours", "alpha", camera, 0.001, find_regions=False) as robot:
+        robot.set_lens(lens)
+        for k in range(1, 5):
+            png = cv2.imencode(".png", rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))[1].tobytes()
+            robot.add_frame(k * 10**8, png, "png", rng.integers(500, 4000, (48, 64), dtype=np.uint16))
+    registry.convert("ros", tmp_path / "ours" / "alpha.mcap", tmp_path / "rec")
+    with (
+        open_rgbd(tmp_path / "ours" / "alpha.mcap") as ours,
+        open_rgbd(tmp_path / "rec" / "alpha.mcap") as again,
+    ):
+        assert again.camera == ours.camera
+        assert len(again) == len(ours)
+        for before, after in zip(ours.frames(), again.frames(), strict=True):
+            assert np.array_equal(before.depth, after.depth)
+            assert np.array_equal(before.color, after.color)
+
+
 def test_times_of_publication(tmp_path: Path) -> None:
     r = Ros(2)
     log = write(tmp_path / "log.mcap", scene(r), "json", r)
@@ -141,7 +167,7 @@ def test_compressed_images_of_foxglove(tmp_path: Path) -> None:
             m = r.compressed(m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, "_depth", png, "png")
         rows.append((topic, ns, m))
     log = write(tmp_path / "log.mcap", rows, "protobuf", r)
-    registry.convert("ros", log, tmp_path / "rec", options=["undistort=false"])
+    registry.convert("ros", log, tmp_path / "rec")
     colors = [
         record.proto().data for record in read_log(tmp_path / "rec" / "alpha.mcap", ["/alpha/camera/color"])
     ]

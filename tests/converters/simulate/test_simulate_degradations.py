@@ -13,7 +13,7 @@ from duagc.converters.simulate.movers import Mover, _figure
 from duagc.converters.simulate.render import triangles
 from duagc.converters.simulate.sensors import light, noise
 from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
-from duagc.converters.simulate.sensors.lens import Lens
+from duagc.converters.simulate.sensors.lens import RadialLens
 from duagc.converters.simulate.sensors.rig import GAMMA, MovingCamera, Rig
 from duagc.converters.simulate.settings import camera_of
 from duagc.converters.simulate.simulated_scenes import SimulatedMeshes
@@ -116,7 +116,7 @@ def test_a_recording_has_the_gains_that_it_states(folder: Path, clean: Path, tmp
 
 @pytest.mark.parametrize("k1", [-0.5, -0.3, 0.2])
 def test_undistortion_is_the_inverse_of_distortion(k1: float) -> None:
-    lens = Lens(CAMERA, k1)
+    lens = RadialLens(CAMERA, k1)
     x, y = np.meshgrid(np.linspace(-0.8, 0.8, 41), np.linspace(-0.6, 0.6, 31))
     there = lens.distort(x, y)
     assert np.stack(lens.undistort(*there)) == pytest.approx(np.stack([x, y]), abs=1e-9)
@@ -131,7 +131,7 @@ def test_undistortion_is_the_inverse_of_distortion(k1: float) -> None:
 
 @pytest.mark.parametrize("k1", [-0.3, 0.2])
 def test_the_undistorted_image_holds_all_that_the_lens_saw_and_a_rim(k1: float) -> None:
-    lens = Lens(CAMERA, k1)
+    lens = RadialLens(CAMERA, k1)
     x, y = lens.rays(0.0, 0.0)
     camera = lens.pinhole
     u, v = camera.fx * x + camera.cx, camera.fy * y + camera.cy
@@ -149,7 +149,7 @@ def test_images_of_a_lens_are_those_of_a_pinhole_but_for_the_rim(
     folder: Path, stage: SimulatedMeshes, tmp_path: Path
 ) -> None:
     recording = simulated(folder, tmp_path / "lens", robots=1, lens_k1=-0.3)
-    lens = Lens(camera_of((64, 48)), -0.3)
+    lens = RadialLens(camera_of((64, 48)), -0.3)
     eye = stage.renderer(lens.pinhole)
     inside = lens.maps()[2]
     with open_rgbd(Recording(recording).log("alpha")) as log:
@@ -274,7 +274,7 @@ def test_all_together_are_in_the_description(all_degradations: Path) -> None:
     description = json.loads((all_degradations / "recording.json").read_text())
     assert description["parameters"]["degradations"]["lens_k1"] == -0.3
     sensors = description["robots"]["alpha"]["sensors"]
-    lens = Lens(camera_of((64, 48)), -0.3)
+    lens = RadialLens(camera_of((64, 48)), -0.3)
     assert float(sensors["rolling_shutter_s"]) == 0.03 * lens.rows_per_row
     assert float(sensors["exposure_s"]) > 0
 

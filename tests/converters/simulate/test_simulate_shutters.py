@@ -11,7 +11,7 @@ from duagc.converters.simulate.frames import FrameJob, FrameRenderer, FrameSetti
 from duagc.converters.simulate.render.raycast import MeshRenderer
 from duagc.converters.simulate.sensors import shutter
 from duagc.converters.simulate.sensors.degradations import Degradations
-from duagc.converters.simulate.sensors.lens import Lens
+from duagc.converters.simulate.sensors.lens import RadialLens
 from duagc.converters.simulate.sensors.rig import BASELINE_M, GAMMA, MovingCamera, Rig
 from duagc.converters.simulate.settings import camera_of
 from duagc.converters.simulate.simulated_scenes import SimulatedMeshes
@@ -101,7 +101,7 @@ def test_nothing_that_stands_still_is_blurred() -> None:
 
 @pytest.mark.parametrize(("k1", "share"), [(-0.3, 0.35), (0.2, 0.6)])
 def test_the_stated_readout_is_that_of_the_undistorted_images(k1: float, share: float) -> None:
-    lens = Lens(CAMERA, k1)
+    lens = RadialLens(CAMERA, k1)
     _, v, inside = lens.maps()
     rows = np.flatnonzero(inside[:, 80])
     true = v[rows, 80] / 119 - 0.5  # when a pixel of the middle column was read, as a share of the readout
@@ -111,7 +111,7 @@ def test_the_stated_readout_is_that_of_the_undistorted_images(k1: float, share: 
 
 
 def test_a_pinhole_is_read_as_long_as_its_lens() -> None:
-    assert Lens(CAMERA, 1e-9).rows_per_row == pytest.approx(1.0, abs=1e-6)
+    assert RadialLens(CAMERA, 1e-9).rows_per_row == pytest.approx(1.0, abs=1e-6)
 
 
 def test_the_right_camera_turns_about_the_left_one(

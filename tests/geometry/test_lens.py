@@ -1,0 +1,65 @@
+"""Cameras with a lens, next to the equations of their models."""
+
+import numpy as np
+import pytest
+
+from duagc.pipeline.geometry import so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.lens import Lens, rectified, seen_by_source
+
+CAMERA = PinholeCamera(64, 48, 50.0, 51.0, 31.0, 24.5)
+SOURCE = PinholeCamera(64, 48, 55.0, 54.0, 33.0, 22.5)
+TURN = (0.02, -0.03, 0.05)
+MODELS = {
+    "no distortion": ((), False),
+    "k1 k2 p1 p2": ((-0.2, 0.05, 0.003, -0.002), False),
+    "k1 k2 p1 p2 k3": ((-0.2, 0.05, 0.003, -0.002, 0.01), False),
+    "rational": ((-0.2, 0.05, 0.003, -0.002, 0.01, 0.1, 0.02, -0.01), False),
+    "fisheye": ((-0.02, 0.01, -0.003, 0.001), True),
+}
+
+
+def expected(lens: Lens, camera: PinholeCamera) -> np.ndarray:
+    """Pixels [h, w, 2] of the source, by the equations that OpenCV documents."""
+    rays = camera.rays() @ so3.exp(np.array(lens.rotation_rad)).T
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    r2 = x**2 + y**2
+    if lens.fisheye:
+        angle = np.arctan(np.sqrt(r2))
+        a2 = angle**2
+        k = lens.distortion
+        bent = angle * (1 + k[0] * a2 + k[1] * a2**2 + k[2] * a2**3 + k[3] * a2**4)
+        scale = np.where(r2 > 0, bent / np.sqrt(np.where(r2 > 0, r2, 1)), 1)
+        x, y = x * scale, y * scale
+    else:
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*lens.distortion, *(0.0,) * (8 - len(lens.distortion)))
+        radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+            y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+        )
+    s = lens.source
+    return np.stack([s.fx * x + s.cx, s.fy * y + s.cy], axis=-1)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), TURN])
+def test_maps_are_those_of_the_equations(name: str, turn: tuple[float, float, float]) -> None:
+    distortion, fisheye = MODELS[name]
+    lens = Lens(SOURCE, distortion, fisheye, turn)
+    found = np.stack(lens.maps(CAMERA), axis=-1)
+    np.testing.assert_allclose(found, expected(lens, CAMERA), atol=2e-5)
+
+
+def test_a_pinhole_seen_by_itself_is_as_it_was() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    maps = Lens(CAMERA).maps(CAMERA)
+    assert np.array_equal(rectified(image, maps), image)
+    assert seen_by_source(maps, 64, 48).all()
+
+
+def test_beyond_the_border_the_border_is_repeated() -> None:
+    """So a rim is no black edge to whoever looks at the image without its mask."""
+    maps = Lens(CAMERA, (0.4, 0.0, 0.0, 0.0)).maps(CAMERA)
+    assert not seen_by_source(maps, 64, 48).all()
+    assert (rectified(np.full((48, 64, 3), 200, np.uint8), maps) == 200).all()
