@@ -15,8 +15,9 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import inside
+from duagc.pipeline.kernels.drawn_depth import drawn_triangles
+from duagc.pipeline.kernels.drawn_depth_definition import Indices, largest
 
-Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 NEAREST_M = 0.05
 LONGEST_SIDE = 0.06  # of a triangle as the LiDAR sees it, in focal lengths: rings may be 3 degrees apart
@@ -45,14 +46,14 @@ def lidar_depth(
     points, rays = _before(points_lidar, T_camera_lidar, camera)
     pixels, inverse = camera.project(points), 1 / points[:, 2]
     triangles = _surfaces(rays)
-    between, change = _drawn(pixels[triangles], inverse[triangles], camera)
+    between, change = (image.ravel() for image in drawn_triangles(pixels, inverse, triangles, camera))
 
     u, v = np.rint(pixels).astype(np.int64).T
     seen = inside(u, v, (camera.height, camera.width))
     pixel = np.where(seen, v * camera.width + u, 0)
     behind_m = np.where(between[pixel] > 0, points[:, 2] - 1 / np.maximum(between[pixel], 1e-9), 0)
     visible = np.flatnonzero(seen & (behind_m <= HIDDEN * points[:, 2] + 3 * range_sigma_m))
-    hit = visible[_largest(pixel[visible], inverse[visible])]
+    hit = visible[largest(pixel[visible], inverse[visible])]
 
     known = between > 0
     depth = np.where(known, 1 / np.where(known, between, 1), 0)
@@ -96,55 +97,3 @@ def _surfaces(rays: Array) -> Indices:
         smooth = (far <= (1 + SAME_SURFACE) * near) | (np.arctan2(across_m, along_m) >= LEAST_SLOPE_RAD)
         sound &= smooth & (np.linalg.norm(beams[a] - beams[b], axis=1) <= LONGEST_SIDE)
     return triangles[sound]
-
-
-def _drawn(corners: Array, inverse: Array, camera: PinholeCamera) -> tuple[Array, Array]:
-    """Inverse depth of the nearest triangle at every pixel, flat, 0 where there is none; and its change of depth, m.
-
-    corners: [t, 3, 2], px. inverse: [t, 3], 1/m; linear over a triangle, which is exact.
-    """
-    nearest, change = np.zeros(camera.height * camera.width), np.zeros(camera.height * camera.width)
-    # sides as a u + b v + c >= 0 inside, row by row the span of columns where all three hold
-    p, q = corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]
-    a, b = p[..., 1] - q[..., 1], q[..., 0] - p[..., 0]
-    c = -(a * p[..., 0] + b * p[..., 1])
-    area = a[:, 0] * corners[:, 0, 0] + b[:, 0] * corners[:, 0, 1] + c[:, 0]
-    usable = np.abs(area) > 1e-9
-    sides = (
-        np.stack([a, b, c], axis=-1)[usable] / area[usable, None, None]
-    )  # barycentric coordinates of (u, v, 1)
-    corners, inverse = corners[usable], inverse[usable]
-    first = np.clip(np.ceil(corners[..., 1].min(axis=1)), 0, camera.height).astype(np.int64)
-    last = np.clip(np.floor(corners[..., 1].max(axis=1)), -1, camera.height - 1).astype(np.int64)
-    triangle, row = _expanded(first, last)
-    slope, rest = sides[triangle, :, 0], sides[triangle, :, 1] * row[:, None] + sides[triangle, :, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        border = -rest / slope
-    low = np.where(slope > 0, border, np.where((slope == 0) & (rest < 0), np.inf, -np.inf)).max(axis=1)
-    high = np.where(slope < 0, border, np.inf).min(axis=1)
-    start = np.ceil(np.clip(low - 1e-9, 0, camera.width)).astype(np.int64)
-    stop = np.floor(np.clip(high + 1e-9, -1, camera.width - 1)).astype(np.int64)
-    span, column = _expanded(start, stop)
-    triangle, row = triangle[span], row[span]
-    at = np.stack([column, row, np.ones(len(row))], axis=-1)
-    found = np.einsum("nij,nj,ni->n", sides[triangle], at, inverse[triangle])
-    pixel = row * camera.width + column
-    chosen = _largest(pixel, found)
-    nearest[pixel[chosen]] = found[chosen]
-    depths = 1 / inverse[triangle[chosen]]
-    change[pixel[chosen]] = depths.max(axis=1) - depths.min(axis=1)
-    return nearest, change
-
-
-def _expanded(first: Indices, last: Indices) -> tuple[Indices, Indices]:
-    """Index k and value of all whole numbers from first[k] to last[k], in order."""
-    count = np.maximum(last - first + 1, 0)
-    index = np.repeat(np.arange(len(first)), count)
-    return index, np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count) + first[index]
-
-
-def _largest(group: Indices, value: Array) -> Indices:
-    """Position of the largest value of every group, the first of equals."""
-    order = np.lexsort((-np.arange(len(group)), value, group))
-    last = np.append(group[order][1:] != group[order][:-1], True)[: len(order)]
-    return np.asarray(order[last], dtype=np.int64)

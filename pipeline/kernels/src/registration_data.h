@@ -95,6 +95,26 @@ struct MovedDepth {
     const float *ray_x, *ray_y;            // [w], [h]
 };
 
+// Triangles of points in an image, to be drawn.
+struct DrawnTriangles {
+    int width, height;
+    size_t count;
+    const double *pixels, *inverse;  // [m, 2], [m]
+    const int64_t* triangles;        // [t, 3]
+};
+
+// A depth image to be drawn from the place of another camera.
+struct PinholeNumbers {
+    double fx, fy, cx, cy;
+};
+struct RegisteredDepth {
+    int width, height, onto_width, onto_height, steps;
+    double nearest_m, same_surface, one_layer;
+    PinholeNumbers from, onto;
+    double T[12];           // rows of the pose of the depth camera in the other one
+    const double* inverse;  // [h, w]
+};
+
 // Memory of one thread, kept between calls.
 struct AlignmentScratch {
     Scratch<float> floats;
@@ -119,6 +139,10 @@ struct RegistrationKernels {
     void (*surface_normals)(const LevelImages&, const NormalPixels&, float* normals);
     // Inverse depth [h, w] (0: unknown), and columns and rows where it was looked up.
     void (*move_depth)(const MovedDepth&, Scratch<uint8_t>&, float* found, float* columns, float* rows);
+    // Inverse depth and change of depth [h, w], 0 at the beginning.
+    void (*draw_triangles)(const DrawnTriangles&, double* nearest, double* change);
+    // Depth [h, w]. Memory: pixels and depths for every sample, images [3, h, w].
+    void (*register_depth)(const RegisteredDepth&, int32_t* pixels, double* depths, double* images, float* depth);
 };
 
 }  // namespace raster

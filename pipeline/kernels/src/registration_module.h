@@ -136,6 +136,31 @@ static void move_depth(const std::string& isa, const Inputs& inverse_depth, cons
     kernels->move_depth(of, alignment_scratch().bytes, found.data(), columns.data(), rows.data());
 }
 
+using Doubles = Array<double>;
+using DoubleInputs = Array<const double>;
+
+static void draw_triangles(const std::string& isa, const DoubleInputs& pixels, const DoubleInputs& inverse, const Array<const int64_t>& triangles,
+                           const Doubles& nearest, const Doubles& change) {
+    const DrawnTriangles of = {static_cast<int>(nearest.shape(1)), static_cast<int>(nearest.shape(0)), triangles.shape(0), pixels.data(),
+                               inverse.data(), triangles.data()};
+    const RegistrationKernels* kernels = kernels_named(isa)->registration;
+    const nb::gil_scoped_release unlocked;
+    kernels->draw_triangles(of, nearest.data(), change.data());
+}
+
+// numbers: least depth, relative step of a surface, of a layer; fx, fy, cx, cy of the depth camera, and of the other one.
+static void register_depth(const std::string& isa, const DoubleInputs& inverse, const DoubleInputs& T, const DoubleInputs& numbers, int steps,
+                           const Array<int32_t>& pixels, const Doubles& depths, const Doubles& images, const Floats& depth) {
+    const double* n = numbers.data();
+    RegisteredDepth of = {static_cast<int>(inverse.shape(1)), static_cast<int>(inverse.shape(0)), static_cast<int>(depth.shape(1)),
+                          static_cast<int>(depth.shape(0)), steps, n[0], n[1], n[2], {n[3], n[4], n[5], n[6]}, {n[7], n[8], n[9], n[10]}, {},
+                          inverse.data()};
+    std::copy(T.data(), T.data() + 12, of.T);
+    const RegistrationKernels* kernels = kernels_named(isa)->registration;
+    const nb::gil_scoped_release unlocked;
+    kernels->register_depth(of, pixels.data(), depths.data(), images.data(), depth.data());
+}
+
 static void define_registration(nb::module_& m) {
     nb::class_<LevelArrays>(m, "LevelArrays")
         .def(nb::init<const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&,
@@ -150,6 +175,8 @@ static void define_registration(nb::module_& m) {
     m.def("halve", halve);
     m.def("surface_normals", surface_normals);
     m.def("move_depth", move_depth);
+    m.def("draw_triangles", draw_triangles);
+    m.def("register_depth", register_depth);
 }
 
 }  // namespace raster
