@@ -4,6 +4,7 @@ Light on purpose: a fresh process imports this module first, and from then on it
 """
 
 import multiprocessing
+import multiprocessing.util
 import os
 import pickle
 import resource
@@ -21,6 +22,7 @@ from duagc.pipeline.base.errors import DuagError
 
 LOW_PRIORITY = 10
 """Nice value of what can wait: a tenth of a processor is left to it next to a task that cannot."""
+LAST = -100  # of what a process does at its end
 _handed_down: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
 
 
@@ -97,11 +99,20 @@ def _begin(handed_down: bytes, start: Callable[..., None] | None, arguments: tup
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=end_with_parent, daemon=True).start()
+    multiprocessing.util.Finalize(None, _end, exitpriority=LAST)
     # what it is of is imported here, and not before Ctrl-C is the parent's
     for learn, known in pickle.loads(handed_down):
         learn(known)
     if start is not None:
         start(*arguments)
+
+
+def _end() -> None:
+    """End at once: what a process has sent is sent, and to take its objects apart takes tenths of a second."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(0)
 
 
 def end_with_parent() -> None:

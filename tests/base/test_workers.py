@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from duagc.pipeline.base import worker_reports
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.workers import LOW_PRIORITY, when_idle, worker_pool
 
@@ -79,6 +80,25 @@ if __name__ == "__main__":
         parent.kill()
         parent.wait(20)
     assert wait_until_gone(pid)
+
+
+def say_and_report(count: int) -> None:
+    """Say a line that stays in a buffer, and report steps that other threads have still to send."""
+    print("said by a worker", end="")
+    for done in range(count):
+        worker_reports.tell(("alpha", "x" * 1000, done, count))
+
+
+def test_what_a_worker_said_and_reported_is_not_lost_at_its_end(capfd: pytest.CaptureFixture[str]) -> None:
+    """A worker ends without taking its objects apart."""
+    heard: list[worker_reports.Step] = []
+    with (
+        worker_reports.listening(heard.append) as queue,
+        worker_pool(1, worker_reports.keep_queue, (queue,)) as pool,
+    ):
+        pool.submit(say_and_report, 500)
+    assert [step[2] for step in heard] == list(range(500))
+    assert capfd.readouterr().out == "said by a worker"
 
 
 def test_what_can_wait_leaves_the_processors_to_others() -> None:
