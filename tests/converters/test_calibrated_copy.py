@@ -281,3 +281,23 @@ def test_stamps_do_not_fall_below_zero(tmp_path: Path) -> None:
     stamped = [messages.unpack_depth(r.proto(), "") for r in read_log(log, [topics.DEPTH])]
     assert len(stamped) == 2
     assert json.loads((tmp_path / "recording.json").read_text())["name"] == "out"
+
+
+def test_images_of_a_lens_are_resampled_where_another_correction_applies(
+    corrected: Recording, tmp_path: Path
+) -> None:
+    """A log states one lens; the second correction is of the images as the first one has them read."""
+    turned = Lens(CAMERA, (), rotation_rad=(0.0, 0.0, 0.02))
+    again = Correction(turned, (0.0,) * 6)
+    write_calibrated(corrected, {"alpha": again}, tmp_path, "twice", calibration={})
+    u, v = turned.maps(CAMERA)
+    with open_rgbd(corrected.log("alpha")) as once, open_rgbd(Recording(tmp_path).log("alpha")) as twice:
+        assert once.lens is not None
+        assert twice.lens is None
+        assert twice.camera == once.camera
+        before, after = once.frame(1), twice.frame(1)
+        assert after.mask is not None
+        expected = cv2.remap(before.color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        off = np.abs(after.color.astype(int) - expected)[after.mask]
+    assert np.mean(off) < 0.1
+    assert np.abs(after.color.astype(int) - before.color)[after.mask].mean() > 2
