@@ -140,7 +140,7 @@ def unpack_calibration(m: Any) -> PinholeCamera:
     camera, lens = unpack_camera(m)
     if lens is not None:
         raise DuagError(
-            f"found lens distortion {m.distortion_model!r} {list(m.D)}, expected undistorted images"
+            f"K, R and P state a lens, with distortion {m.distortion_model!r} {list(m.D)}, expected undistorted images"
         )
     return camera
 
@@ -156,11 +156,11 @@ def unpack_camera(m: Any) -> tuple[PinholeCamera, Lens | None]:
     """
     source = _pinhole(m, numbers(m.K, (3, 3), "K"), "K")
     turn = numbers(m.R, (3, 3), "R") if any(m.R) else np.eye(3)
-    if not np.any(m.D) and np.array_equal(turn, np.eye(3)):
+    P = numbers(m.P, (3, 4), "P") if any(m.P) or any(m.D) else np.hstack([source.matrix(), np.zeros((3, 1))])
+    if not any(m.D) and np.array_equal(turn, np.eye(3)) and np.array_equal(P[:, :3], source.matrix()):
         return source, None
     if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6 or np.linalg.det(turn) < 0:
         raise DuagError(f"R is {turn.ravel().tolist()}, expected a rotation")
-    P = numbers(m.P, (3, 4), "P")
     if np.any(P[:, 3]):
         raise DuagError(f"P is {P.ravel().tolist()}, expected a camera at the place of K")
     D, fisheye = tuple(float(d) for d in m.D), m.distortion_model == FISHEYE
