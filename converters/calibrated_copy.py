@@ -197,11 +197,10 @@ class _Copy:
                 topics.VALID.of(self._robot), shown, record.log_time_ns, record.publish_time_ns
             )
         self._has_color = True
-        image = self._images.decode(record)
         if self._lens is None:
             self._writer.copy(self._log, record)
             return
-        message = record.proto()
+        message, image = record.proto(), self._images.decode(record)
         message.data, message.format = encode_png(rectified(image, self._maps)[:, :, ::-1]), "png"
         self._writer.write(record.topic, message, record.log_time_ns, record.publish_time_ns)
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.found_regions import FoundRegions
+from duagc.converters.layouts.sigma_units import SIGMA_SCALE_M, sigma_units
 from duagc.converters.layouts.sound_camera import check_camera
 from duagc.converters.layouts.validity import mask_of_user
 from duagc.pipeline import messages
@@ -31,7 +32,6 @@ from duagc.schemas import topics
 
 NANOSECONDS = 1_000_000_000
 FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
-SIGMA_SCALE_M = 1e-4  # of the images of standard deviations
 
 
 class RobotWriter:
@@ -246,12 +246,7 @@ class RobotWriter:
         if not self._has_sigma:
             self._log.channel(topic, topics.DEPTH_SIGMA.schema, {DEPTH_SCALE_KEY: repr(SIGMA_SCALE_M)})
             self._has_sigma = True
-        is_known = (depth > 0) & (np.asarray(sigma_m) > 0)
-        most = np.iinfo(np.uint16).max
-        units = np.clip(np.rint(np.asarray(sigma_m, dtype=np.float64) / SIGMA_SCALE_M), 1, most)
-        # five binary digits say all that a sigma can, and take a third of the space
-        step = 2.0 ** np.maximum(np.frexp(units)[1] - 5, 0)
-        raw = np.where(is_known, np.minimum(np.rint(units / step) * step, most), 0).astype(np.uint16)
+        raw = sigma_units(sigma_m, depth)
         self._log.write(topic, messages.pack_depth(taken_ns, self.name, raw), stamp_ns, taken_ns)
 
     def set_depth_camera(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,8 @@ class RosCamera:
         fisheye: whether the distortion is that of the equidistant model.
         frame_id: without the slash that ROS 1 may put before it.
         is_straight: whether it says that there is no distortion, by numbers that are all zero.
-        rotation_rad: rotation vector [3] that takes directions of the rectified camera, of P, to those of this one.
+        R: nine numbers, row by row, that take directions of this camera to those of the rectified one, of P, as they
+            are stated; empty: not stated.
     """
 
     camera: PinholeCamera
@@ -47,14 +48,14 @@ class RosCamera:
     fisheye: bool
     frame_id: str
     is_straight: bool = False
-    rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    R: tuple[float, ...] = ()
 
     @staticmethod
     def of(message: Any, rectified: bool, where: str) -> RosCamera:
         """From a CameraInfo of ROS 1 or 2. rectified: the images belong to P, without distortion."""
-        K, D, P = (
+        K, D, R, P = (
             np.array(getattr(message, name if hasattr(message, name) else name.lower()), dtype=np.float64)
-            for name in ("K", "D", "P")
+            for name in ("K", "D", "R", "P")
         )
         if K.size != 9 or P.size not in (0, 12):
             raise DuagError(f"{where}: K and P of {K.size} and {P.size} numbers, expected 9 and 12")
@@ -85,7 +86,7 @@ class RosCamera:
             (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
         )
         if not np.any(D):
-            return RosCamera(camera, (), False, frame, len(D) > 0)
+            return RosCamera(camera, (), False, frame, len(D) > 0, tuple(R.tolist()))
         fisheye = model in FISHEYE
         if fisheye:  # of four numbers, but drivers of RealSense send the five of their structure
             D = np.concatenate([D[:4], np.trim_zeros(D[4:], "b")])
@@ -97,14 +98,33 @@ class RosCamera:
             raise DuagError(
                 f"{where}: distortion {D.tolist()} of {model!r}, expected {' or '.join(map(str, lengths))} numbers"
             )
-        return RosCamera(camera, tuple(D.tolist()), fisheye, frame, rotation_rad=_turn(message, where))
+        return RosCamera(camera, tuple(D.tolist()), fisheye, frame, R=tuple(R.tolist()))
 
     @property
     def lens(self) -> Lens | None:
         """How its images are taken; None: as a pinhole camera does."""
-        if not self.distortion:
-            return None
+        return self._lens if self.distortion else None
+
+    @property
+    def _lens(self) -> Lens:
         return Lens(self.camera, self.distortion[:4] if self.fisheye else self.distortion, self.fisheye)
+
+    def lens_of_rectified(self, where: str) -> Lens:
+        """How its images are taken, for the rectified camera, which R may turn.
+
+        Args:
+            where: begins the line of an error.
+        """
+        if not any(self.R):  # nobody set it
+            return self._lens
+        R = np.array(self.R)
+        if (
+            R.size != 9
+            or not np.abs(R.reshape(3, 3) @ R.reshape(3, 3).T - np.eye(3)).max() < MAX_ROTATION_DEFECT
+        ):
+            raise DuagError(f"{where}: R is {R.tolist()}, expected a rotation")
+        x, y, z = so3.log(so3.project(R.reshape(3, 3).T)).tolist()
+        return replace(self._lens, rotation_rad=(x, y, z))
 
     def maps(self, onto: PinholeCamera | None = None) -> Maps | None:
         """Where in its images every pixel of a pinhole at the same place lies; None without distortion.
@@ -114,14 +134,3 @@ class RosCamera:
         """
         lens = self.lens
         return None if lens is None else lens.maps(onto or self.camera)
-
-
-def _turn(message: Any, where: str) -> tuple[float, float, float]:
-    """The rotation vector of a CameraInfo from its rectified camera to that of its images."""
-    R = np.array(message.R if hasattr(message, "R") else message.r, dtype=np.float64)
-    if not np.any(R):  # nobody set it
-        return 0.0, 0.0, 0.0
-    if R.size != 9 or not np.abs(R.reshape(3, 3) @ R.reshape(3, 3).T - np.eye(3)).max() < MAX_ROTATION_DEFECT:
-        raise DuagError(f"{where}: R is {R.tolist()}, expected a rotation")
-    x, y, z = so3.log(so3.project(R.reshape(3, 3).T)).tolist()
-    return x, y, z

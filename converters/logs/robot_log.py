@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path, PurePath
 from typing import Any
@@ -14,7 +13,14 @@ import numpy as np
 from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.layouts.ros_images import is_integer_depth, size_of
 from duagc.converters.layouts.tum_layout import Listed, associate, nearest_s
-from duagc.converters.logs.cameras import CameraWatch, as_stated, is_rectified, stated, stated_camera
+from duagc.converters.logs.cameras import (
+    CameraWatch,
+    as_stated,
+    is_own_depth,
+    is_rectified,
+    stated,
+    stated_camera,
+)
 from duagc.converters.logs.choice import Chooser, video_words
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
@@ -117,7 +123,7 @@ class RobotLog:
         self.warnings += sweeps.warnings
         return sweeps
 
-    @property
+    @cached_property
     def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
         """Where the camera of the recording is in the color camera: turned, if that is rectified."""
         if self.derived:
@@ -162,26 +168,24 @@ class RobotLog:
             )
         return ImageTopic(topic, frame, chosen, camera)
 
-    @property
+    @cached_property
     def lens(self) -> Lens | None:
         """With which the color images were taken that the recording keeps; None: by its camera."""
-        lens = self.color_camera.lens
-        if lens is None or not self.settings.undistort or isinstance(self.derived, Stereo):
+        if not self.settings.undistort or isinstance(self.derived, Stereo):
             return None
-        return (
-            replace(lens, rotation_rad=self.color_camera.rotation_rad) if self._is_depth_rectified else lens
-        )
+        if self._is_depth_rectified:
+            return self.color_camera.lens_of_rectified(f"{self.name}: camera of {self.color}")
+        return self.color_camera.lens
 
     @cached_property
     def _is_depth_rectified(self) -> bool:
         """Whether depth is registered to color as it looks without distortion, while color is recorded with it."""
-        registered = self.derived is None and self.T_color_depth is None and self.settings.undistort
+        if self.derived is not None or self.T_color_depth is not None or not self.settings.undistort:
+            return False
+        if is_own_depth(self.depth, self._own):
+            return True
         stated_so = self._has_own_info and self.depth_camera.is_straight
-        return (
-            registered
-            and (self._is_rectified(self.depth) or stated_so)
-            and bool(self.color_camera.distortion)
-        )
+        return (is_rectified(self.depth) or stated_so) and bool(self.color_camera.distortion)
 
     @property
     def valid(self) -> Mask | None:

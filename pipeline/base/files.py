@@ -102,6 +102,21 @@ def decode_image(data: bytes, flags: int) -> NDArray[Any] | None:
         return None
 
 
+def encode_jpeg(image: NDArray[Any], quality: int) -> bytes:
+    """An image as JPEG.
+
+    Args:
+        image: uint8 [h, w, 3], BGR.
+        quality: 0 to 100.
+    """
+    import cv2
+
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise RuntimeError("the JPEG encoder refused an 8-bit image")
+    return data.tobytes()
+
+
 def encode_png(image: NDArray[Any]) -> bytes:
     """An image as PNG, as fast as it goes: OpenCV's own choice of filter and strategy.
 

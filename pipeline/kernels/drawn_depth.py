@@ -34,6 +34,8 @@ def drawn_triangles(
         )
     if len(triangles) and not (triangles.min() >= 0 and triangles.max() < points):
         raise ValueError(f"a triangle has a point that is none of {points}")
+    if not (np.isfinite(corners).all() and (inverse > 0).all()):
+        raise ValueError("found corners or inverse depths that no point before a camera has")
     nearest, change = (np.zeros((camera.height, camera.width)) for _ in range(2))
     _raster.draw_triangles(
         isa,

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.files import encode_jpeg
+
 Image = NDArray[Any]
 NOTHING = (236, 239, 242)  # where there is no value: the light gray of the page
 
@@ -24,10 +26,8 @@ def jpeg_uri(rgb: Image, width: int) -> str:
     height = max(1, round(rgb.shape[0] * width / rgb.shape[1]))
     shrinks = width < rgb.shape[1]
     small = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
-    if not done:
-        raise RuntimeError("the JPEG encoder refused an 8-bit image")
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    data = encode_jpeg(small[:, :, ::-1], quality=88)
+    return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
 
 
 def to_uint8(color: Image) -> NDArray[np.uint8]:

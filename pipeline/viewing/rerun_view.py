@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import new_file
+from duagc.pipeline.base.files import encode_jpeg, new_file
 from duagc.pipeline.messages import camera_frame
 from duagc.pipeline.recording import RECORDING_FILE, Recording, open_rgbd, read_log
 from duagc.pipeline.recording.color_images import ColorImages
@@ -126,12 +126,11 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
 
 def _rectified_color(path: Path, robot: str, images: ColorImages) -> Iterator[Chunk]:
     """Color of a log whose images have a lens, which Rerun does not take out, where and when Rerun has the others."""
-    import cv2
     import rerun as rr
     from rerun.chunk import Chunk
 
     for record in read_log(path, [topics.COLOR]):
-        _, data = cv2.imencode(".jpg", images.decode(record)[:, :, ::-1])
+        data = encode_jpeg(images.decode(record)[:, :, ::-1], quality=95)
         times = {LOG_TIME: record.log_time_ns, PUBLISH_TIME: record.publish_time_ns}
         yield Chunk.from_columns(
             record.topic,
@@ -139,7 +138,7 @@ def _rectified_color(path: Path, robot: str, images: ColorImages) -> Iterator[Ch
                 rr.TimeColumn(name, timestamp=[np.datetime64(time, "ns")]) for name, time in times.items()
             ],
             columns=[
-                *rr.EncodedImage.columns(blob=[data.tobytes()], media_type=["image/jpeg"]),
+                *rr.EncodedImage.columns(blob=[data], media_type=["image/jpeg"]),
                 *rr.CoordinateFrame.columns(frame=[f"{camera_frame(robot)}_image_plane"]),
             ],
         )

@@ -7,6 +7,7 @@ from scipy.spatial import Delaunay
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import available_isas, drawn_depth, drawn_depth_definition
+from tests.kernels.depth_surfaces import SIZES, camera_of, surfaces
 
 ISAS = available_isas()
 MOTIONS = {
@@ -16,19 +17,6 @@ MOTIONS = {
     "turned away": np.array([0.1, 0.0, 0.0, 0.0, 2.5, 0.0]),
     "far off": np.array([1e9, 0.0, 0.0, 0.0, 0.3, 0.0]),
 }
-SIZES = {"odd": (37, 23), "wide": (300, 40), "one pixel": (1, 1), "one row": (64, 1), "one column": (1, 64)}
-
-
-def camera_of(width: int, height: int) -> PinholeCamera:
-    return PinholeCamera(width, height, 0.9 * width + 3, 0.8 * width + 3, 0.47 * width, 0.55 * height)
-
-
-def surfaces(camera: PinholeCamera, holes: float = 0.1) -> np.ndarray:
-    """Inverse depth of slanted planes at steps, with holes."""
-    rng = np.random.default_rng(camera.width)
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    inverse = 0.4 + 0.3 * u / camera.width + 0.2 * v / camera.height + 0.9 * ((u // 7 + v // 9) % 3 == 0)
-    return np.where(rng.random(inverse.shape) < holes, 0, inverse)
 
 
 def points_of(camera: PinholeCamera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -76,5 +64,8 @@ def test_what_is_no_triangle_or_no_image_is_refused() -> None:
             drawn_depth.drawn_triangles(corners, inverse, np.array(triangle), camera)
     with pytest.raises(ValueError, match=r"expected \[m, 2\], \[m\], \[t, 3\]"):
         drawn_depth.drawn_triangles(corners, inverse[:2], np.array([[0, 1, 1]]), camera)
+    for corner, depth in ((np.nan, 1.0), (0.0, 0.0)):
+        with pytest.raises(ValueError, match="that no point before a camera has"):
+            drawn_depth.drawn_triangles(corners + corner, inverse * depth, np.array([[0, 1, 2]]), camera)
     with pytest.raises(ValueError, match="expected that of PinholeCamera"):
         drawn_depth.registered_depth(np.ones((30, 39)), camera, np.eye(4), camera, steps=1)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import available_isas, moved_depth, moved_depth_definition
+from tests.kernels.depth_surfaces import SIZES, camera_of, surfaces
 
 ISAS = available_isas()
 MOTIONS = {
@@ -15,25 +15,6 @@ MOTIONS = {
     "turned away": np.array([0.1, 0.0, 0.0, 0.0, 2.5, 0.0]),
     "farther than integers": np.array([1e9, 0.0, 0.0, 0.0, 0.3, 0.0]),
 }
-SIZES = {
-    "odd": (37, 23),
-    "two batches": (300, 40),
-    "one pixel": (1, 1),
-    "one row": (64, 1),
-    "one column": (1, 64),
-}
-
-
-def camera_of(width: int, height: int) -> PinholeCamera:
-    return PinholeCamera(width, height, 0.9 * width + 3, 0.8 * width + 3, 0.47 * width, 0.55 * height)
-
-
-def surfaces(camera: PinholeCamera, holes: float = 0.1) -> np.ndarray:
-    """Inverse depth of slanted planes at steps, with holes."""
-    rng = np.random.default_rng(camera.width)
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    inverse = 0.4 + 0.3 * u / camera.width + 0.2 * v / camera.height + 0.9 * ((u // 7 + v // 9) % 3 == 0)
-    return np.where(rng.random(inverse.shape) < holes, 0, inverse).astype(np.float32)
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -41,7 +22,7 @@ def surfaces(camera: PinholeCamera, holes: float = 0.1) -> np.ndarray:
 @pytest.mark.parametrize("size", SIZES)
 def test_points_are_those_of_the_definition(size: str, motion: str, isa: str) -> None:
     camera, T = camera_of(*SIZES[size]), se3.exp(MOTIONS[motion])
-    inverse = surfaces(camera)
+    inverse = surfaces(camera).astype(np.float32)
     nearest = np.where(np.random.default_rng(1).random(inverse.shape) < 0.3, 0, inverse.max()).astype(
         np.float32
     )
@@ -53,7 +34,7 @@ def test_points_are_those_of_the_definition(size: str, motion: str, isa: str) ->
 
 def test_what_does_not_move_is_found_where_it_is() -> None:
     camera = camera_of(64, 48)
-    inverse = surfaces(camera)
+    inverse = surfaces(camera).astype(np.float32)
     found, u, v = moved_depth.found_points(inverse, inverse, camera, np.eye(4), middle=0.5)
     known = inverse > 0
     assert (found[known] > 0).mean() > 0.99

@@ -111,11 +111,14 @@ def test_transforms_that_never_change_are_extrinsics(tmp_path: Path, expected: d
         registry.convert("ros", path, tmp_path / "rec3")
 
 
+@pytest.mark.parametrize("distortion", [(), (-0.3, 0.1, 0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.03, -0.02, 0.05)])
-def test_a_log_of_ours_with_a_lens_is_read_as_it_is(tmp_path: Path, turn: tuple[float, float, float]) -> None:
+def test_a_log_of_ours_with_a_lens_is_read_as_it_is(
+    tmp_path: Path, turn: tuple[float, float, float], distortion: tuple[float, ...]
+) -> None:
     """Its color has the distortion, its depth has none: registered depth of others has that of color."""
     camera = PinholeCamera(64, 48, 50.0, 51.0, 31.0, 23.0)
-    lens = Lens(PinholeCamera(64, 48, 52.0, 50.0, 32.0, 24.0), (-0.3, 0.1, 0.0, 0.0, 0.0), rotation_rad=turn)
+    lens = Lens(PinholeCamera(64, 48, 52.0, 50.0, 32.0, 24.0), distortion, rotation_rad=turn)
     (tmp_path / "ours").mkdir()
     rng = np.random.default_rng(0)
     with RobotWriter(tmp_path / "ours", "alpha", camera, 0.001, find_regions=False) as robot:
