@@ -80,7 +80,11 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         _part("frontend", "stage: track and map", _MATHEMATICS, _LOGS, "posegraph", estimator=True),
         _part("information", "stage: Fisher information", _MATHEMATICS, _LOGS, estimator=True),
         _part("runs", "what stages leave, as arrays", _MATHEMATICS, _LOGS, "posegraph consensus"),
-        _part("converters", "datasets, logs, simulator", "base config geometry schemas messages recording"),
+        _part(
+            "converters",
+            "datasets, logs, simulator",
+            "base config geometry kernels schemas messages recording",
+        ),
     ),
     (
         _part(

@@ -20,7 +20,6 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from duagc.converters.layouts import reference_poses
 from duagc.converters.layouts.calibrated import correct, is_pinhole, numbers, square_camera
-from duagc.converters.layouts.displaced_depth import DepthRegistration
 from duagc.converters.layouts.image_files import kept_color, options_of, read_depth, rigid
 from duagc.converters.layouts.image_folder import LengthOptions
 from duagc.converters.layouts.self_check import ReprojectionCheck
@@ -35,6 +34,7 @@ from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import depth_error, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import Lens
+from duagc.pipeline.kernels.drawn_depth import displaced_depth
 
 Depth = Array
 Reference = dict[int, Array]  # T_world_color [4, 4] by frame number
@@ -292,14 +292,15 @@ def _write_robot(
     label: str,
 ) -> dict[str, Any]:
     """Write all frames of a robot; returns what the self-check measured."""
-    register = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)
+    cameras = options.depth_camera(), options.color_camera()
     check = ReprojectionCheck(options.color_camera(), len(frames))
     lens, correction = options.lens(), options.depth_correction()
     robot.set_lens(None if is_pinhole(lens) else lens)
     holes = invalid = 0
 
     def images(files: SevenScenesFrame) -> tuple[bytes, str, Depth]:
-        depth = register(correct(_depth_m(files.depth), options.depth_camera(), correction))
+        measured = correct(_depth_m(files.depth), options.depth_camera(), correction)
+        depth = displaced_depth(measured, *cameras, options.baseline_m)
         return *kept_color(files.color, (WIDTH, HEIGHT)), depth
 
     found = zip(frames, in_order(images, frames), strict=True)

@@ -69,9 +69,7 @@ def registered_depth(
     """
     if inverse.shape != (depth_camera.height, depth_camera.width) or steps < 1:
         raise ValueError(f"an image is {inverse.shape} with {steps} samples, expected that of {depth_camera}")
-    numbers = [NEAREST_M, SAME_SURFACE, ONE_LAYER]
-    for c in (depth_camera, camera):
-        numbers += [c.fx, c.fy, c.cx, c.cy]
+    numbers = [NEAREST_M, SAME_SURFACE, ONE_LAYER, *_pinhole(depth_camera), *_pinhole(camera)]
     depth = np.empty((camera.height, camera.width), dtype=np.float32)
     given = (inverse, T_camera_depth[:3], np.array(numbers))
     inputs = [np.ascontiguousarray(array, dtype=np.float64) for array in given]
@@ -79,3 +77,28 @@ def registered_depth(
     memory = np.empty(most, dtype=np.int32), np.empty(most), np.empty((3, depth.size))
     _raster.register_depth(isa, *inputs, steps, *memory, depth)
     return depth
+
+
+def displaced_depth(
+    depth: Array, depth_camera: PinholeCamera, camera: PinholeCamera, baseline_m: float, *, isa: str = "auto"
+) -> Array:
+    """`kernels.drawn_depth_definition.displaced_depth`.
+
+    Args:
+        depth: [h, w], meters along z of the depth camera, 0 = unknown.
+        depth_camera: that measured it.
+        camera: the other one.
+        baseline_m: its place along x of the depth camera.
+        isa: instruction set, as of `Rasterizer`.
+    """
+    if depth.shape != (depth_camera.height, depth_camera.width) or depth_camera.height < 2:
+        raise ValueError(f"an image is {depth.shape}, expected that of {depth_camera}, two rows or more")
+    numbers = np.array([baseline_m, SAME_SURFACE, *_pinhole(depth_camera), *_pinhole(camera)])
+    displaced = np.empty((camera.height, camera.width))
+    memory = np.empty((2, depth_camera.width))
+    _raster.displace_depth(isa, np.ascontiguousarray(depth, dtype=np.float64), numbers, memory, displaced)
+    return displaced
+
+
+def _pinhole(camera: PinholeCamera) -> tuple[float, float, float, float]:
+    return camera.fx, camera.fy, camera.cx, camera.cy

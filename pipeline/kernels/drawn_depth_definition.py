@@ -150,3 +150,76 @@ def _nearest(drawn: Sequence[Samples], camera: PinholeCamera) -> NDArray[np.floa
         np.add.at(total, pixel[front], 1 / z[front])
     depth = np.where(count > 0, count / np.where(count > 0, total, 1), 0)
     return depth.reshape(camera.height, camera.width).astype(np.float32)
+
+
+def displaced_depth(
+    depth: Array, depth_camera: PinholeCamera, camera: PinholeCamera, baseline_m: float
+) -> Array:
+    """The depth image of one camera as another one would see it that stands next to it along x, turned the same way.
+
+    With w = 1 / z a point of depth pixel (u, v) falls on column A u + B - f b w and row A v + C: rows map to rows.
+    First the rows are resampled, then each row is redrawn as a chain of segments between neighbors. Inverse depth is
+    interpolated, in which planes are linear, and only within a surface; where surfaces overlap the nearest wins; at
+    the border of a surface a pixel covers half its width.
+
+    Args:
+        depth: [h, w], meters along z of the depth camera, 0 = unknown; two rows or more.
+        depth_camera: that measured it.
+        camera: the other one.
+        baseline_m: its place along x of the depth camera.
+
+    Returns:
+        [camera.height, camera.width], meters along z of `camera`, 0 = unknown.
+    """
+    w = _rows_between(depth, depth_camera, camera)
+    zoom = camera.fx / depth_camera.fx
+    x = (
+        zoom * np.arange(depth_camera.width)
+        + (camera.cx - zoom * depth_camera.cx)
+        - camera.fx * baseline_m * w
+    )
+    out = np.zeros((camera.height, camera.width))
+    left, right, w_left, w_right = x[:, :-1], x[:, 1:], w[:, :-1], w[:, 1:]
+    joined = _one_surface(w_left, w_right)
+    first = np.ceil(left)
+    for column in (first, first + 1):  # connected neighbors are less than two columns apart
+        part = (column - left) / np.where(right > left, right - left, 1.0)
+        _keep_nearest(out, joined & (column <= right), column, w_left + part * (w_right - w_left))
+    column = np.rint(x)
+    border_left, border_right = np.ones(w.shape, bool), np.ones(w.shape, bool)
+    border_left[:, 1:] = ~joined
+    border_right[:, :-1] = ~joined
+    covered = np.where(column < x, border_left, border_right) & (np.abs(column - x) <= 0.5 * zoom)
+    _keep_nearest(out, covered & (w > 0), column, w)
+    return _inverted(out)
+
+
+def _rows_between(depth: Array, depth_camera: PinholeCamera, camera: PinholeCamera) -> Array:
+    """Inverse depth [camera.height, depth_camera.width] along the rows of the other camera, 0 where there is none."""
+    row = (np.arange(camera.height) - camera.cy) * (depth_camera.fy / camera.fy) + depth_camera.cy
+    near = np.clip(np.floor(row).astype(np.int64), 0, depth_camera.height - 2)
+    part = (row - near)[:, None]
+    w = _inverted(depth)
+    upper, lower = w[near], w[near + 1]
+    between = _one_surface(upper, lower) & (part >= 0) & (part <= 1)
+    inside = (row >= -0.5) & (row <= depth_camera.height - 0.5)
+    found = np.where(between, upper + part * (lower - upper), np.where(part < 0.5, upper, lower))
+    return np.where(inside[:, None], found, 0.0)
+
+
+def _inverted(values: Array) -> Array:
+    """Depth as inverse depth, or the other way round; 0 stays 0."""
+    with np.errstate(divide="ignore"):
+        return np.where(values > 0, 1.0 / values, 0.0)
+
+
+def _one_surface(a: Array, b: Array) -> NDArray[np.bool_]:
+    """Whether two inverse depths belong to one surface; no measurement belongs to none."""
+    return (a > 0) & (b > 0) & (np.abs(a - b) <= SAME_SURFACE * np.minimum(a, b))
+
+
+def _keep_nearest(out: Array, mask: NDArray[np.bool_], column: Array, inverse: Array) -> None:
+    """Write inverse depths into the columns of their rows where none is larger."""
+    drawn = np.flatnonzero(mask & (column >= 0) & (column < out.shape[1]))
+    rows, columns = drawn // mask.shape[1], column.ravel()[drawn].astype(np.int64)
+    np.maximum.at(out.ravel(), rows * out.shape[1] + columns, inverse.ravel()[drawn])

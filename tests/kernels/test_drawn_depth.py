@@ -56,6 +56,20 @@ def test_registered_depth_is_that_of_the_definition(size: str, motion: str, step
     assert size in ("one pixel", "one row", "one column") or motion != "usual" or (found > 0).mean() > 0.2
 
 
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("baseline_m", [0.0, 0.03, -0.4])
+@pytest.mark.parametrize("size", [name for name, (_, height) in SIZES.items() if height > 1])
+def test_displaced_depth_is_that_of_the_definition(size: str, baseline_m: float, isa: str) -> None:
+    depth_camera = camera_of(*SIZES[size])
+    inverse = surfaces(depth_camera)
+    depth = np.where(inverse > 0, 1 / np.where(inverse > 0, inverse, 1), 0)
+    for camera in (camera_of(50, 31), depth_camera):
+        found = drawn_depth.displaced_depth(depth, depth_camera, camera, baseline_m, isa=isa)
+        wanted = drawn_depth_definition.displaced_depth(depth, depth_camera, camera, baseline_m)
+        np.testing.assert_array_equal(found.view(np.int64), wanted.view(np.int64))
+    assert size == "one column" or baseline_m < 0 or (found > 0).mean() > 0.2
+
+
 def test_what_is_no_triangle_or_no_image_is_refused() -> None:
     camera = camera_of(40, 30)
     corners, inverse = np.zeros((3, 2)), np.ones(3)
@@ -69,3 +83,5 @@ def test_what_is_no_triangle_or_no_image_is_refused() -> None:
             drawn_depth.drawn_triangles(corners + corner, inverse * depth, np.array([[0, 1, 2]]), camera)
     with pytest.raises(ValueError, match="expected that of PinholeCamera"):
         drawn_depth.registered_depth(np.ones((30, 39)), camera, np.eye(4), camera, steps=1)
+    with pytest.raises(ValueError, match=r"expected that of PinholeCamera.*, two rows or more"):
+        drawn_depth.displaced_depth(np.ones((30, 39)), camera, camera, 0.1)

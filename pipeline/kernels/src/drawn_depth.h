@@ -124,4 +124,62 @@ static void register_depth(const RegisteredDepth& of, int32_t* pixels, double* d
     for (size_t pixel = 0; pixel < size; pixel++) depth[pixel] = count[pixel] > 0.0 ? static_cast<float>(count[pixel] / total[pixel]) : 0.0f;
 }
 
+static bool one_surface(double a, double b, double same_surface) {
+    return a > 0.0 && b > 0.0 && std::fabs(a - b) <= same_surface * (a < b ? a : b);
+}
+
+// A row of the depth image between two of its own: inverse depth, 0 where there is none.
+static void row_between(const DisplacedDepth& of, int near, double part, double* inverse) {
+    const double *const above = of.depth + static_cast<std::ptrdiff_t>(near) * of.width, *const below = above + of.width;
+    const bool inside = part >= 0.0 && part <= 1.0;
+    for (int column = 0; column < of.width; column++) {
+        const double upper = above[column] > 0.0 ? 1.0 / above[column] : 0.0, lower = below[column] > 0.0 ? 1.0 / below[column] : 0.0;
+        const double nearest = part < 0.5 ? upper : lower;
+        inverse[column] = inside && one_surface(upper, lower, of.same_surface) ? upper + part * (lower - upper) : nearest;
+    }
+}
+
+static void keep_nearest(double column, double inverse, int width, double* line) {
+    if (!(column >= 0.0 && column < static_cast<double>(width))) return;
+    double& kept = line[static_cast<int>(column)];
+    kept = inverse > kept ? inverse : kept;
+}
+
+// A row as a chain of segments between neighbors; at the border of a surface a pixel covers half its width.
+static void draw_row(const DisplacedDepth& of, const double* inverse, const double* x, double* line) {
+    const double half = 0.5 * (of.onto.fx / of.from.fx);
+    bool joined_left = false;
+    for (int k = 0; k < of.width; k++) {
+        const bool joined_right = k + 1 < of.width && one_surface(inverse[k], inverse[k + 1], of.same_surface);
+        if (joined_right) {
+            const double left = x[k], right = x[k + 1], first = std::ceil(left), width = right > left ? right - left : 1.0;
+            for (int next = 0; next < 2; next++) {  // connected neighbors are less than two columns apart
+                const double column = first + next, part = (column - left) / width;
+                if (column <= right) keep_nearest(column, inverse[k] + part * (inverse[k + 1] - inverse[k]), of.onto_width, line);
+            }
+        }
+        const double nearest = std::nearbyint(x[k]);
+        const bool border = nearest < x[k] ? !joined_left : !joined_right;
+        if (border && std::fabs(nearest - x[k]) <= half && inverse[k] > 0.0) keep_nearest(nearest, inverse[k], of.onto_width, line);
+        joined_left = joined_right;
+    }
+}
+
+// Rows of the one camera are rows of the other.
+static void displace_depth(const DisplacedDepth& of, double* inverse, double* x, double* depth) {
+    const double zoom = of.onto.fx / of.from.fx, offset = of.onto.cx - zoom * of.from.cx, shift = of.onto.fx * of.baseline_m;
+    const double most = static_cast<double>(of.height - 2);
+    for (int row = 0; row < of.onto_height; row++) {
+        double* const line = depth + static_cast<std::ptrdiff_t>(row) * of.onto_width;
+        for (int column = 0; column < of.onto_width; column++) line[column] = 0.0;
+        const double at = (static_cast<double>(row) - of.onto.cy) * (of.from.fy / of.onto.fy) + of.from.cy;
+        if (!(at >= -0.5 && at <= static_cast<double>(of.height) - 0.5)) continue;
+        const double start = std::floor(at), near = start < 0.0 ? 0.0 : (start > most ? most : start);
+        row_between(of, static_cast<int>(near), at - near, inverse);
+        for (int k = 0; k < of.width; k++) x[k] = zoom * static_cast<double>(k) + offset - shift * inverse[k];
+        draw_row(of, inverse, x, line);
+        for (int column = 0; column < of.onto_width; column++) line[column] = line[column] > 0.0 ? 1.0 / line[column] : 0.0;
+    }
+}
+
 }  // namespace KERNEL_ISA

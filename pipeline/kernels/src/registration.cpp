@@ -9,5 +9,5 @@ extern const RegistrationKernels REGISTRATION_TABLE;
 const RegistrationKernels REGISTRATION_TABLE = {KERNEL_ISA::align_at,      KERNEL_ISA::align,        KERNEL_ISA::gray_of_color,
                                                 KERNEL_ISA::gray_of_color, KERNEL_ISA::invert_depth, KERNEL_ISA::halve,
                                                 KERNEL_ISA::surface_normals, KERNEL_ISA::move_depth,   KERNEL_ISA::draw_triangles,
-                                                KERNEL_ISA::register_depth};
+                                                KERNEL_ISA::register_depth, KERNEL_ISA::displace_depth};
 }  // namespace raster

@@ -115,6 +115,14 @@ struct RegisteredDepth {
     const double* inverse;  // [h, w]
 };
 
+// A depth image to be drawn from the place of a camera that is displaced along x alone.
+struct DisplacedDepth {
+    int width, height, onto_width, onto_height;
+    double baseline_m, same_surface;
+    PinholeNumbers from, onto;
+    const double* depth;  // [h, w]
+};
+
 // Memory of one thread, kept between calls.
 struct AlignmentScratch {
     Scratch<float> floats;
@@ -143,6 +151,8 @@ struct RegistrationKernels {
     void (*draw_triangles)(const DrawnTriangles&, double* nearest, double* change);
     // Depth [h, w]. Memory: pixels and depths for every sample, images [3, h, w].
     void (*register_depth)(const RegisteredDepth&, int32_t* pixels, double* depths, double* images, float* depth);
+    // Depth [h, w]. Memory: two rows of the depth image.
+    void (*displace_depth)(const DisplacedDepth&, double* inverse, double* x, double* depth);
 };
 
 }  // namespace raster

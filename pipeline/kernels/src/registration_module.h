@@ -161,6 +161,18 @@ static void register_depth(const std::string& isa, const DoubleInputs& inverse, 
     kernels->register_depth(of, pixels.data(), depths.data(), images.data(), depth.data());
 }
 
+// numbers: baseline, relative step of a surface; fx, fy, cx, cy of the depth camera, and of the other one. memory: two rows of the depth image.
+static void displace_depth(const std::string& isa, const DoubleInputs& depth, const DoubleInputs& numbers, const Doubles& memory,
+                           const Doubles& displaced) {
+    const double* n = numbers.data();
+    const DisplacedDepth of = {static_cast<int>(depth.shape(1)), static_cast<int>(depth.shape(0)), static_cast<int>(displaced.shape(1)),
+                               static_cast<int>(displaced.shape(0)), n[0], n[1], {n[2], n[3], n[4], n[5]}, {n[6], n[7], n[8], n[9]},
+                               depth.data()};
+    const RegistrationKernels* kernels = kernels_named(isa)->registration;
+    const nb::gil_scoped_release unlocked;
+    kernels->displace_depth(of, memory.data(), memory.data() + depth.shape(1), displaced.data());
+}
+
 static void define_registration(nb::module_& m) {
     nb::class_<LevelArrays>(m, "LevelArrays")
         .def(nb::init<const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&,
@@ -177,6 +189,7 @@ static void define_registration(nb::module_& m) {
     m.def("move_depth", move_depth);
     m.def("draw_triangles", draw_triangles);
     m.def("register_depth", register_depth);
+    m.def("displace_depth", displace_depth);
 }
 
 }  // namespace raster

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from duagc.converters.datasets.seven_scenes import Options
-from duagc.converters.layouts.displaced_depth import DepthRegistration
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels.drawn_depth import displaced_depth
 
 
 def slanted(camera: PinholeCamera, slope: float) -> np.ndarray:
@@ -19,7 +19,7 @@ def test_planes_stay_planes(slope: float) -> None:
     options = Options()
     depth = slanted(options.depth_camera(), slope)
     depth[(depth < 0.3) | (depth > 4)] = 0
-    out = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
+    out = displaced_depth(depth, options.depth_camera(), options.color_camera(), options.baseline_m)
     # the plane in the color camera, which sits baseline_m further along x
     rays = options.color_camera().rays()[:, :, 0]
     exact = (1.2 + slope * options.baseline_m) / (1 - slope * rays)
@@ -37,7 +37,7 @@ def test_the_nearest_surface_wins_and_edges_stay_sharp() -> None:
     options = Options()
     depth = np.full((480, 640), 2.0)
     depth[:, 300:340] = 0.8
-    out = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
+    out = displaced_depth(depth, options.depth_camera(), options.color_camera(), options.baseline_m)
     values = np.unique(np.round(out, 9))
     assert values.tolist() == [0.0, 0.8, 2.0], "nothing is interpolated across the edge"
     columns = np.nonzero(out[240] == np.min(out[240][out[240] > 0]))[0]
@@ -51,9 +51,10 @@ def test_the_nearest_surface_wins_and_edges_stay_sharp() -> None:
 
 def test_no_depth_stays_none() -> None:
     options = Options()
-    register = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)
-    assert not register(np.zeros((480, 640))).any()
-    same = DepthRegistration(options.depth_camera(), options.depth_camera(), 0.0)
+    camera = options.depth_camera()
+    assert not displaced_depth(np.zeros((480, 640)), camera, options.color_camera(), options.baseline_m).any()
     depth = slanted(options.depth_camera(), 0.5)
     depth[100:110, 50:300] = 0
-    np.testing.assert_allclose(same(depth), depth, rtol=1e-12)  # the identity keeps every hole
+    np.testing.assert_allclose(
+        displaced_depth(depth, camera, camera, 0.0), depth, rtol=1e-12
+    )  # the identity keeps every hole
