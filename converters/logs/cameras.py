@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any
@@ -19,6 +20,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.names import DEPTH_SCALE_KEY
 from duagc.schemas import topics
 
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
@@ -142,7 +144,7 @@ def realsense_extrinsics(log: Log, color: str, depth: str, name: str) -> Array |
 def as_stated(log: Log, depth: str, settings: LogOptions, *, own: bool) -> LogOptions:
     """The settings with what is known of depth by its log, unless they state it.
 
-    That is the unit where RealSense's own software recorded it, and that it is registered where DUAG-C did.
+    That is the unit where RealSense's own software or DUAG-C recorded it, and that DUAG-C's is registered.
 
     Args:
         log: the log.
@@ -152,17 +154,30 @@ def as_stated(log: Log, depth: str, settings: LogOptions, *, own: bool) -> LogOp
     Raises:
         DuagError: what the log states is no unit.
     """
+    known: dict[str, object] = {}
     if is_own_depth(depth, own) and settings.registered == "auto":
-        return settings.model_copy(update={"registered": "yes"})
+        known["registered"] = "yes"
+    if "depth_scale" not in settings.model_fields_set and (unit := _stated_unit(log, depth, own)):
+        where, meters = unit
+        if not 0 < meters < 1:
+            raise DuagError(
+                f"{log.name}: {where} is {meters:g}, expected meters per unit, or --set depth_scale=METERS"
+            )
+        known["depth_scale"] = meters
+    return settings.model_copy(update=known)
+
+
+def _stated_unit(log: Log, depth: str, own: bool) -> tuple[str, float] | None:
+    """Meters per unit of a depth image, and where the log states them."""
+    text = log.topics[depth].metadata.get(DEPTH_SCALE_KEY) if own else None
+    if text is not None:
+        try:
+            return f"{DEPTH_SCALE_KEY} of {depth}", float(text)
+        except ValueError:
+            return f"{DEPTH_SCALE_KEY} of {depth}", math.nan
     sensor = depth.removesuffix("/image/data").rpartition("/")[0]
     named = [f"{sensor}/option/Depth{blank}Units/value" for blank in " _"]  # of older and newer software
     found = [topic for topic in log.of_type("std_msgs/msg/Float32") if topic in named]
-    if not found or not depth.endswith("/image/data") or "depth_scale" in settings.model_fields_set:
-        return settings
-    topic = found[0]
-    meters = float(f"{log.first(topic).data:.6g}")  # 0.001 is not one of the 32-bit numbers
-    if not 0 < meters < 1:
-        raise DuagError(
-            f"{log.name}: {topic} is {meters:g}, expected meters per unit, or --set depth_scale=METERS"
-        )
-    return settings.model_copy(update={"depth_scale": meters})
+    if not found or not depth.endswith("/image/data"):
+        return None
+    return found[0], float(f"{log.first(found[0]).data:.6g}")  # 0.001 is not one of the 32-bit numbers

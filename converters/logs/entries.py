@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
@@ -21,6 +21,7 @@ class LogTopic:
         schema: as the file names them.
         encoding: as the file names them.
         count: messages.
+        metadata: that the channel states, where the container holds any.
     """
 
     name: str
@@ -28,6 +29,7 @@ class LogTopic:
     schema: str
     encoding: str
     count: int
+    metadata: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,8 @@ class McapFile:
             )
         if count or not known:
             total = count + (known.count if known else 0)
-            self.topics[channel.topic] = LogTopic(channel.topic, kind, name, encoding, total)
+            stated = dict(channel.metadata)
+            self.topics[channel.topic] = LogTopic(channel.topic, kind, name, encoding, total, stated)
 
     def _records(self) -> Iterator[Any]:
         """Schemas, channels and messages in the order of the file; several may be on their way."""

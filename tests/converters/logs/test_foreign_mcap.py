@@ -116,12 +116,12 @@ def test_transforms_that_never_change_are_extrinsics(tmp_path: Path, expected: d
 def test_a_log_of_ours_with_a_lens_is_read_as_it_is(
     tmp_path: Path, turn: tuple[float, float, float], distortion: tuple[float, ...]
 ) -> None:
-    """Its color has the distortion, its depth has none: registered depth of others has that of color."""
+    """Its color has the distortion, its depth has none and a unit: registered depth of others has that of color."""
     camera = PinholeCamera(64, 48, 50.0, 51.0, 31.0, 23.0)
     lens = Lens(PinholeCamera(64, 48, 52.0, 50.0, 32.0, 24.0), distortion, rotation_rad=turn)
     (tmp_path / "ours").mkdir()
     rng = np.random.default_rng(0)
-    with RobotWriter(tmp_path / "ours", "alpha", camera, 0.001, find_regions=False) as robot:
+    with RobotWriter(tmp_path / "ours", "alpha", camera, 0.0002, find_regions=False) as robot:
         robot.set_lens(lens)
         for k in range(1, 5):
             png = cv2.imencode(".png", rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))[1].tobytes()
