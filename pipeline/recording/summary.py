@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.recording.folder import Recording
 from duagc.pipeline.recording.names import DIGEST_RECORD, LOG_RECORD, RECORDING_FILE, ROBOT_KEY
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
@@ -144,10 +145,22 @@ def _frames_info(path: Path) -> dict[str, Any]:
             "start_ns": stamps[0],
             "end_ns": stamps[-1],
             "camera": asdict(log.camera),
+            "lens": _lens_info(log.lens),
             "depth_scale_m": log.depth_scale,
             "masked_share": 0.0 if log.valid is None else float(np.mean(~log.valid)),
             **reach(some_frames(log)),
         }
+
+
+def _lens_info(lens: Lens | None) -> dict[str, Any] | None:
+    if lens is None:
+        return None
+    return {
+        "source": asdict(lens.source),
+        "distortion": list(lens.distortion),
+        "fisheye": lens.fisheye,
+        "rotation_rad": list(lens.rotation_rad),
+    }
 
 
 def write_preview_of(path: Path, out: Path) -> None:
@@ -206,6 +219,10 @@ def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
         f"center {c['cx']:g} {c['cy']:g} px, depth in {row['depth_scale_m']:g} m",
         f"    ground truth: {row['groundtruth'] or 'none'}",
     ]
+    if row["lens"]:
+        model = "fisheye distortion" if row["lens"]["fisheye"] else "distortion"
+        numbers = " ".join(f"{number:g}" for number in row["lens"]["distortion"]) or "none"
+        lines.append(f"    color images as the lens took them, {model} {numbers}: reading rectifies them")
     if row["masked_share"]:
         lines.append(f"    {row['masked_share']:.1%} of the pixels never show the scene and are masked")
     try:

@@ -8,9 +8,22 @@ import cv2
 import numpy as np
 import pytest
 
+from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.recording import format_info, info, open_rgbd, preview, write_preview_of
-from tests.fixtures.recording_logs import CAMERA, COLOR, DEPTH, write_camera, write_recording, write_updates
+from tests.fixtures.recording_logs import (
+    CAMERA,
+    COLOR,
+    DEPTH,
+    FRAME_NS,
+    depth,
+    image,
+    png,
+    write_camera,
+    write_recording,
+    write_updates,
+)
 
 
 def test_info_of_a_recording(tmp_path: Path) -> None:
@@ -24,6 +37,19 @@ def test_info_of_a_recording(tmp_path: Path) -> None:
     assert json.loads(json.dumps(content)) == content
     assert alpha["depth_m"][0] < alpha["depth_m"][1] < alpha["depth_m"][2] < 5
     assert re.search(r"alpha +4 +0\.10 +30\.00 +0 +0\.0 +100%", format_info(content))
+
+
+def test_info_of_images_with_a_lens(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        robot.set_lens(Lens(CAMERA, (-0.3, 0.1, 0.0, 0.0, 0.0)))
+        for k in range(3):
+            robot.add_frame(k * FRAME_NS, png(image(k)), "png", depth(k))
+    content = info(tmp_path / "rec")
+    assert content["robots"]["alpha"]["lens"]["distortion"] == [-0.3, 0.1, 0.0, 0.0, 0.0]
+    assert json.loads(json.dumps(content)) == content
+    line = "color images as the lens took them, distortion -0.3 0.1 0 0 0: reading rectifies them"
+    assert line in format_info(content)
+    assert "lens" not in format_info(info(write_recording(tmp_path / "straight")))
 
 
 def test_a_preview_shows_every_robot(tmp_path: Path) -> None:
