@@ -43,11 +43,11 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.recording.greatest_depth import unmeasured
+from duagc.pipeline.recording.greatest_depth import SATURATED, unmeasured
 from duagc.pipeline.recording.register_depth import register_depth
 
 Options = LogOptions
-FARTHEST = np.iinfo(np.uint16).max  # in units of depth
+FARTHEST = SATURATED - 1  # in units of depth
 TRUTH_REMEDY = "--set truth_offset_s=SECONDS to add to the poses' times, or --set time_source=log"
 
 

@@ -41,7 +41,6 @@ Reference = dict[int, Array]  # T_world_color [4, 4] by frame number
 
 WIDTH, HEIGHT = 640, 480
 DEPTH_SCALE = 0.001
-NO_DEPTH = (0, 65535)
 FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)")
 SEQUENCE_FOLDER = re.compile(r"seq-(\d+)")
 KINDS = ("color", "depth", "pose")
@@ -341,7 +340,7 @@ def _count_holes(depth: NDArray[np.uint16]) -> int:
 
 def _depth_m(path: Path) -> Depth:
     """Depth [480, 640] in meters, 0 where there is none."""
-    raw = read_depth(path, (WIDTH, HEIGHT), "depth in millimeters", NO_DEPTH)
+    raw = read_depth(path, (WIDTH, HEIGHT), "depth in millimeters")
     return raw.astype(np.float64) * DEPTH_SCALE
 
 

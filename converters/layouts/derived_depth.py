@@ -17,6 +17,7 @@ from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, encode_png
+from duagc.pipeline.recording.greatest_depth import SATURATED
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.motion import GyroPrior, MotionPrior
 
@@ -97,7 +98,7 @@ class StereoFrames:
         units = np.rint(depth_m / STEREO_SCALE_M)
         return (
             encode_png(color),
-            np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16),
+            np.where(units < SATURATED, units, 0).astype(np.uint16),
             sigma_m,
         )
 

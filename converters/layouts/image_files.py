@@ -15,6 +15,7 @@ from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import decode_image, read_bytes
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.recording.greatest_depth import without_saturated
 
 COLOR = "a color image"
 PNG, JPEG = b"\x89PNG", b"\xff\xd8\xff"  # the first bytes
@@ -78,7 +79,7 @@ def _whole_color(path: Path, data: bytes, size: tuple[int, int]) -> NDArray[np.u
 def read_depth(
     path: Path, size: tuple[int, int], unit: str = "depth", no_depth: Sequence[int] = ()
 ) -> NDArray[np.uint16]:
-    """A 16-bit depth image [H, W], in the units of its file.
+    """A 16-bit depth image [H, W], in the units of its file, 0 where there is none; the largest number is none.
 
     Args:
         path: of the file.
@@ -95,7 +96,7 @@ def read_depth(
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise DuagError(f"{path}: is {raw.dtype} with {raw.ndim} axes, expected 16-bit {unit}")
     check_size(path, raw.shape, size)
-    depth = np.asarray(raw, dtype=np.uint16)
+    depth = without_saturated(raw)
     for value in no_depth:
         if value:
             depth[depth == value] = 0

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, encode_png
+from duagc.pipeline.recording.greatest_depth import without_saturated
 
 Depth = NDArray[np.float32]
 _COLOR_CODES = {  # encoding: channels, and the name of OpenCV's conversion to BGR
@@ -241,11 +242,11 @@ def in_meters(values: NDArray[np.uint16] | Depth, scale: float, float_scale: flo
 
 
 def depth_values(message: Any, where: str) -> NDArray[np.uint16] | Depth:
-    """Depth [h, w], 0 where there is none: integers as they stand, uint16, or meters, float32."""
+    """Depth [h, w], 0 where there is none: integers as they stand but for the largest, uint16, or meters, float32."""
     if hasattr(message, "format"):
         return _compressed_depth(message.format, _whole(message, where), where)
     if message.encoding in ("16UC1", "mono16"):
-        return rows_of(message, where, "uint16", 1)[..., 0]
+        return without_saturated(rows_of(message, where, "uint16", 1)[..., 0])
     if message.encoding == "32FC1":
         return _sound(rows_of(message, where, "float32", 1)[..., 0])
     raise DuagError(f"{where}: encoding {message.encoding!r}, expected one of {', '.join(DEPTH_ENCODINGS)}")
@@ -280,7 +281,7 @@ def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] 
             raise kind(f"{where}: no decoder finds 16-bit depth in it, expected a PNG of 16 bits")
         values = image.astype(np.uint16)
     if encoding != "32FC1":
-        return values
+        return without_saturated(values)
     if plain:
         raise DuagError(f"{where}: inverse depth without its header of 12 bytes, expected compressedDepth")
     _, a, b = struct.unpack("<iff", data[:12])

@@ -18,12 +18,11 @@ from duagc.pipeline.frontend.failure import saturated_share_of
 from duagc.pipeline.kernels.pyramid import gray_of_color
 from duagc.pipeline.messages import unpack_stamp
 from duagc.pipeline.recording import Record, RgbdFrame
-from duagc.pipeline.recording.greatest_depth import greatest_apart
+from duagc.pipeline.recording.greatest_depth import SATURATED, greatest_apart
 from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics as topic_table
 
 FEW_FRAMES = 0.1  # of a recording: so many with saturated or far depth are enough to be reported
-SATURATED = 65535  # the largest number of a 16-bit depth image
 BINS = 8  # of a color histogram, per channel
 TAKE_FOR_NONE = "let the converter take it for none; `convert ros`: --set farthest_m=METERS"
 

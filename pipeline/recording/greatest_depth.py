@@ -14,6 +14,17 @@ STEPS_APART = 10
 """Times the usual step between depths of a sensor that counts in coarse ones, likewise."""
 LEAST_SHARE = 0.005
 """Of the known depth of each image that this distance has."""
+SATURATED = 65535
+"""The largest number of a 16-bit depth image: whatever its unit, it is no distance."""
+
+
+def without_saturated(image: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """A depth image with 0, unknown, where it has the largest number.
+
+    Args:
+        image: [h, w], units of depth.
+    """
+    return np.where(image == SATURATED, np.uint16(0), image)
 
 
 def unmeasured(images: Sequence[NDArray[Any]]) -> tuple[float, float]:

@@ -49,5 +49,14 @@ def test_values_that_mean_no_depth_are_zero(tmp_path: Path) -> None:
     path = tmp_path / "depth.png"
     cv2.imwrite(str(path), depth)
     np.testing.assert_array_equal(read_depth(path, SIZE), depth)
-    found = read_depth(path, SIZE, no_depth=(0, 7, 1000, 65535))
+    found = read_depth(path, SIZE, no_depth=(0, 7, 1000))
     np.testing.assert_array_equal(found, np.where((depth == 7) | (depth == 1000), 0, depth))
+
+
+def test_the_largest_number_is_no_depth_in_any_image(tmp_path: Path) -> None:
+    """Also where it comes late or seldom, so that it could not be found in the first images."""
+    depth = np.full((HEIGHT, WIDTH), 1200, dtype=np.uint16)
+    depth[0, :3] = 65534, 65535, 0
+    cv2.imwrite(str(tmp_path / "depth.png"), depth)
+    expected = np.where(depth == 65535, 0, depth)
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.png", SIZE), expected)

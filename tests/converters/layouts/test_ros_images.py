@@ -132,6 +132,17 @@ def test_depth_of_sixteen_bits_and_of_floats(big: bool) -> None:
     assert np.array_equal(got[1:], meters[1:])
 
 
+def test_the_largest_number_is_no_depth() -> None:
+    raw = depth_image()
+    raw[0, :2] = 65535, 65534
+    expected = np.where(raw == 65535, 0, raw)
+    head, r = struct.pack("<iff", 0, 0.0, 0.0), Ros(2)
+    png = r.compressed(1, "d", head + cv2.imencode(".png", raw)[1].tobytes(), "16UC1; compressedDepth png")
+    packed = r.compressed(1, "d", head + rvl(raw), "16UC1; compressedDepth rvl")
+    for message in (r.image(1, "d", raw, "16UC1"), png, packed):
+        np.testing.assert_array_equal(ros_images.depth_values(message, "here"), expected)
+
+
 def test_compressed_depth() -> None:
     raw = depth_image()
     r = Ros(2)
