@@ -173,7 +173,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     log, pairs, derived = source.name, source.pairs, source.derived
     readings, rows = _Readings(robot, source), source.check_rows()
     if isinstance(derived, Sweeps):
-        robot.set_lidar(derived.lidar.T_camera_lidar, derived.lidar.range_sigma_m)
+        robot.set_lidar(derived.T_camera_lidar, derived.range_sigma_m)
     check = ReprojectionCheck(source.camera, len(pairs), gap)
     rules = _rules_of_depth(source)
     without = empty = far = lost = 0

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.geometry import so3
+from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import FISHEYE_NUMBERS, POLYNOMIAL_NUMBERS, Lens, Maps
 
@@ -39,8 +40,9 @@ class RosCamera:
         fisheye: whether the distortion is that of the equidistant model.
         frame_id: without the slash that ROS 1 may put before it.
         is_straight: whether it says that there is no distortion, by numbers that are all zero.
-        R: nine numbers, row by row, that take directions of this camera to those of the rectified one, of P, as they
-            are stated; empty: not stated.
+        R: nine numbers, row by row, that take directions of the camera of `frame_id` to those of the rectified one, of
+            P, as they are stated; empty: not stated.
+        is_rectified: whether this is the rectified one.
     """
 
     camera: PinholeCamera
@@ -49,6 +51,7 @@ class RosCamera:
     frame_id: str
     is_straight: bool = False
     R: tuple[float, ...] = ()
+    is_rectified: bool = False
 
     @staticmethod
     def of(message: Any, rectified: bool, where: str) -> RosCamera:
@@ -60,7 +63,8 @@ class RosCamera:
         if K.size != 9 or P.size not in (0, 12):
             raise DuagError(f"{where}: K and P of {K.size} and {P.size} numbers, expected 9 and 12")
         model, frame = message.distortion_model, message.header.frame_id.removeprefix("/")
-        if rectified and np.any(P):
+        rectified = rectified and bool(np.any(P))
+        if rectified:
             fx, cx, fy, cy = P[0], P[2], P[5], P[6]
             D = np.zeros(0)
         else:
@@ -86,7 +90,7 @@ class RosCamera:
             (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
         )
         if not np.any(D):
-            return RosCamera(camera, (), False, frame, len(D) > 0, tuple(R.tolist()))
+            return RosCamera(camera, (), False, frame, len(D) > 0, tuple(R.tolist()), rectified)
         fisheye = model in FISHEYE
         if fisheye:  # of four numbers, but drivers of RealSense send the five of their structure
             D = np.concatenate([D[:4], np.trim_zeros(D[4:], "b")])
@@ -115,16 +119,28 @@ class RosCamera:
         Args:
             where: begins the line of an error.
         """
-        if not any(self.R):  # nobody set it
-            return self._lens
-        R = np.array(self.R)
-        if (
-            R.size != 9
-            or not np.abs(R.reshape(3, 3) @ R.reshape(3, 3).T - np.eye(3)).max() < MAX_ROTATION_DEFECT
-        ):
-            raise DuagError(f"{where}: R is {R.tolist()}, expected a rotation")
-        x, y, z = so3.log(so3.project(R.reshape(3, 3).T)).tolist()
+        x, y, z = so3.log(self._rotation(where).T).tolist()
         return replace(self._lens, rotation_rad=(x, y, z))
+
+    def T_images_frame(self, where: str) -> Array:  # noqa: N802 (a transform)
+        """From the camera of `frame_id`, which transforms name, to that of the images: turned, if they are rectified.
+
+        Args:
+            where: begins the line of an error.
+        """
+        return se3.from_rotation_translation(
+            self._rotation(where) if self.is_rectified else np.eye(3), np.zeros(3)
+        )
+
+    def _rotation(self, where: str) -> Array:
+        """R [3, 3]."""
+        if not any(self.R):  # nobody set it
+            return np.eye(3)
+        R = np.array(self.R)
+        defect = np.abs(R.reshape(3, 3) @ R.reshape(3, 3).T - np.eye(3)).max() if R.size == 9 else np.inf
+        if not (defect < MAX_ROTATION_DEFECT and np.linalg.det(R.reshape(3, 3)) > 0):
+            raise DuagError(f"{where}: R is {R.tolist()}, expected a rotation")
+        return so3.project(R.reshape(3, 3))
 
     def maps(self, onto: PinholeCamera | None = None) -> Maps | None:
         """Where in its images every pixel of a pinhole at the same place lies; None without distortion.
@@ -134,3 +150,16 @@ class RosCamera:
         """
         lens = self.lens
         return None if lens is None else lens.maps(onto or self.camera)
+
+
+def between_images(T_first_second: Array, first: RosCamera, second: RosCamera, where: str) -> Array:
+    """A transform between the frames of two cameras as one between those of their images, which may be rectified.
+
+    Args:
+        T_first_second: [4, 4], between the frames.
+        first: one camera.
+        second: the other one.
+        where: begins the line of an error.
+    """
+    a, b = (camera.T_images_frame(f"{where}: camera of {camera.frame_id!r}") for camera in (first, second))
+    return a @ T_first_second @ se3.inverse(b)

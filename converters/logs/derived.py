@@ -17,7 +17,7 @@ from duagc.converters.layouts.derived_depth import (
     StereoFrames,
     spread,
 )
-from duagc.converters.layouts.ros_camera import RosCamera
+from duagc.converters.layouts.ros_camera import RosCamera, between_images
 from duagc.converters.layouts.ros_images import check_decodes, color_bytes
 from duagc.converters.layouts.ros_points import PointTimes
 from duagc.converters.layouts.stereo import RawCamera, StereoRig
@@ -50,8 +50,8 @@ class Picture:
 class Derived(Protocol):
     """A source of depth.
 
-    camera: of the recording. T_color_camera [4, 4]: where it is in the log's color camera. valid: bool [h, w], pixels
-    of the recording's images that show the scene; None: all.
+    camera: of the recording. T_color_camera [4, 4]: where it is in that of the log's color images. valid: bool [h, w],
+    pixels of the recording's images that show the scene; None: all.
     """
 
     camera: PinholeCamera
@@ -103,23 +103,32 @@ class Sweeps:
     T_color_camera = np.eye(4)
 
     def __init__(
-        self, lidar: LidarSource, camera: PinholeCamera, where: tuple[str, str], warnings: Sequence[str] = ()
+        self, lidar: LidarSource, color: RosCamera, where: tuple[str, str], warnings: Sequence[str] = ()
     ) -> None:
-        """where: of color and points, for the line of an error. warnings: what users should know of it."""
-        self.lidar, self.camera, self._where, self.warnings = lidar, camera, where, warnings
+        """Set up.
+
+        Args:
+            lidar: seen from the frame of color, as its motion is.
+            color: the camera of the images.
+            where: of color and points, for the line of an error.
+            warnings: what users should know of it.
+        """
+        self._lidar, self.camera, self._where, self.warnings = lidar, color.camera, where, warnings
+        self.T_camera_lidar = color.T_images_frame(where[0]) @ lidar.T_camera_lidar
+        self.range_sigma_m = lidar.range_sigma_m
 
     def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
         where = f"{self._where[0]} at {color_ns} ns"
         data, color_format = color_bytes(color, where)
         if hasattr(color, "format"):
             check_decodes(data, where)
-        points = self.lidar.points(partner, partner_ns, color_ns, f"{self._where[1]} at {partner_ns} ns")
+        points = self._lidar.points(partner, partner_ns, color_ns, f"{self._where[1]} at {partner_ns} ns")
         return Picture(data, color_format, points_lidar=points)
 
     def depth_m(self, picture: Picture) -> Array:
         assert picture.points_lidar is not None
-        T, sigma_m = self.lidar.T_camera_lidar, self.lidar.range_sigma_m
-        return lidar_depth(picture.points_lidar, T, self.camera, sigma_m)[0].astype(np.float64)
+        depth_m, _ = lidar_depth(picture.points_lidar, self.T_camera_lidar, self.camera, self.range_sigma_m)
+        return depth_m.astype(np.float64)
 
 
 def stereo_of(
@@ -183,6 +192,7 @@ def stereo_of(
             f"{where}: P of {right[1]} has no base line, and /tf_static does not tie {right[2].frame_id!r} to "
             f"{color[2].frame_id!r}; expected --set T_color_depth='x y z qw qx qy qz' of the right camera"
         )
+    T_left_right = between_images(T_left_right, color[2], right[2], log.name)
     rig = StereoRig.of(raw[0], raw[1], se3.inverse(T_left_right), where, options=settings)
     return Stereo(rig, size, where)
 
@@ -210,8 +220,10 @@ def sweeps_of(
         DuagError: nothing says where it is.
     """
     frame = log.first(topic).header.frame_id
+    where = f"{log.name}: {color[0]}", f"{log.name}: {topic}"
     if settings.T_color_depth:
-        T: Array | None = extrinsics_of("T_color_depth", settings.T_color_depth)
+        T_images_lidar = extrinsics_of("T_color_depth", settings.T_color_depth)
+        T: Array | None = se3.inverse(color[1].T_images_frame(where[0])) @ T_images_lidar
     else:
         T = transforms.lookup(color[1].frame_id, frame)
     if T is None:
@@ -220,8 +232,7 @@ def sweeps_of(
             "expected --set T_color_depth='x y z qw qx qy qz' of the LiDAR"
         )
     some = [entry.read() for entry in islice(log.entries(topic), TIMED_SWEEPS)]
-    lidar = LidarSource(T, settings.range_sigma_m, motion, PointTimes.found(some, f"{log.name}: {topic}"))
-    where = f"{log.name}: {color[0]}", f"{log.name}: {topic}"
+    lidar = LidarSource(T, settings.range_sigma_m, motion, PointTimes.found(some, where[1]))
     warnings = list[str]()
     if motion is None:
         warnings.append(
@@ -231,7 +242,7 @@ def sweeps_of(
         warnings.append(f"{topic}: {lidar.times.words}")
     if not settings.T_color_depth:
         warnings += body_axes_of_camera(color[1].frame_id, frame, T, "T_color_depth")
-    return Sweeps(lidar, color[1].camera, where, warnings)
+    return Sweeps(lidar, color[1], where, warnings)
 
 
 def some_pairs(pairs: dict[int, int]) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from duagc.converters.layouts.ros_camera import RosCamera
+from duagc.converters.layouts.ros_camera import RosCamera, between_images
 from duagc.converters.logs.cameras import realsense_extrinsics
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import Transforms
@@ -141,7 +141,9 @@ def extrinsics(
         )
     if words := body_axes_of_cameras(color_frame, depth_frame, T):
         transforms.warnings.append(words)
-    return T
+    if not (color_frame and depth_frame):
+        return T
+    return between_images(T, color.camera, depth.camera, log.name)
 
 
 def body_axes_of_cameras(color_frame: str, depth_frame: str, T_color_depth: Array) -> str:

@@ -125,11 +125,12 @@ class RobotLog:
 
     @cached_property
     def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
-        """Where the camera of the recording is in the color camera: turned, if that is rectified."""
+        """Where the camera of the recording is in the frame of color: turned, if that is rectified, here or before."""
+        T_frame_images = se3.inverse(self.color_camera.T_images_frame(f"{self.name}: camera of {self.color}"))
         if self.derived:
-            return self.derived.T_color_camera
-        lens = self.lens
-        return np.eye(4) if lens is None else se3.from_rotation_translation(lens.rotation(), np.zeros(3))
+            return T_frame_images @ self.derived.T_color_camera
+        turn = np.eye(3) if self.lens is None else self.lens.rotation()
+        return T_frame_images @ se3.from_rotation_translation(turn, np.zeros(3))
 
     def depth_m(self, picture: Picture) -> Array:
         """Depth [h, w] of a picture in meters, 0 = none."""

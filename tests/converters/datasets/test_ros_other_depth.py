@@ -12,14 +12,17 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from duagc.converters import registry
+from duagc.converters.layouts.derived_depth import LidarSource
 from duagc.converters.layouts.ros_camera import RosCamera
+from duagc.converters.layouts.ros_points import VELODYNE
 from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
-from duagc.converters.logs.derived import stereo_of
+from duagc.converters.logs.derived import Sweeps, stereo_of
 from duagc.converters.logs.options import LogOptions
+from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.recording import Recording, open_rgbd, read_log
 from tests.fixtures.lidar_logs import FRAMES, START, lidar_log
 from tests.fixtures.ros_bags import Ros, odometry, still
 from tests.fixtures.s3e import (
@@ -108,6 +111,11 @@ def test_a_stereo_pair(tmp_path: Path, stated: str) -> None:
             assert known.mean() > 0.7
             assert np.median((np.abs(frame.depth - truth) / truth)[known]) < 0.01
             assert np.median(np.abs(frame.color.astype(int) - color)) < 12
+    groundtruth = recording.groundtruth("alpha")
+    assert groundtruth is not None
+    stated_poses = [record.proto() for record in read_log(groundtruth) if "pose" in record.topic]
+    for found, T in zip(stated_poses, poses(), strict=True):
+        np.testing.assert_allclose(messages.unpack_pose_in_frame(found), T @ turn, atol=1e-6)
 
 
 def test_a_pair_whose_rows_do_not_meet_is_refused(tmp_path: Path) -> None:
@@ -184,6 +192,17 @@ def test_images_with_half_of_the_pixels_have_half_of_the_projection() -> None:
     )
     assert half.camera.cx == pytest.approx((whole.camera.cx + 0.5) / 2 - 0.5)
     assert half.baseline_m == pytest.approx(whole.baseline_m)
+
+
+def test_a_lidar_beside_color_that_is_rectified_already() -> None:
+    """It moves with the frame of color; it is drawn from where the turned images are taken."""
+    R = so3.exp([0.02, -0.03, 0.01])
+    turned = RosCamera(LEFT, (), False, "cam", R=tuple(R.ravel().tolist()), is_rectified=True)
+    T = se3.exp([0.1, -0.2, 0.05, 0.3, 0.2, 1.0])
+    sweeps = Sweeps(LidarSource(T, 0.02, None, VELODYNE), turned, ("color", "points"))
+    np.testing.assert_allclose(
+        sweeps.T_camera_lidar, se3.from_rotation_translation(R, np.zeros(3)) @ T, atol=1e-12
+    )
 
 
 def test_a_lidar_and_what_turns_it(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from duagc.converters.logs.choice import Chooser
 from duagc.converters.logs.files import open_log
 from duagc.converters.logs.registration import is_named_registered
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.recording.read import LogFile
@@ -151,6 +151,37 @@ def test_depth_with_a_lens_of_its_own_fits_rectified_color(tmp_path: Path) -> No
     assert maps is not None
     np.testing.assert_array_equal(bent, cv2.remap(straight, *maps, cv2.INTER_NEAREST))
     assert (bent != straight).any()
+
+
+@pytest.mark.parametrize("topic", ["image_raw", "image_rect_color"])
+def test_rectified_color_is_turned_by_its_rectification(tmp_path: Path, topic: str) -> None:
+    """Transforms name the frame of the camera, not of the images that R turned."""
+    r, R = Ros(2), so3.exp([0.0, np.radians(4.0), 0.0])
+    color = r.info(START_NS, "rgb", SMALL)
+    color.r = R.ravel()
+    infos = {"/rgb/camera_info": color, "/depth/camera_info": r.info(START_NS, "d", SMALL)}
+    rows = still(r, (f"/rgb/{topic}", "rgb"), ("/depth/image_raw", "d"), infos)
+    tie = "/tf_static", START_NS, r.tf(r.transform(START_NS, "rgb", "d", np.eye(4)))
+    registry.convert("ros", r.write(tmp_path / "bag", [tie, *rows], "sqlite3"), tmp_path / "rec")
+    depth, _ = first(tmp_path / "rec")
+    border = SMALL.rays()[SMALL.height // 2, SMALL.width // 2] - [0.5 / SMALL.fx, 0.0, 0.0]
+    column, row = SMALL.project((R if topic == "image_rect_color" else np.eye(3)) @ border)
+    line = depth[round(float(row))]
+    near, far = np.flatnonzero((line > 0) & (line < 1.5)), np.flatnonzero(line > 1.5)
+    assert near.max() < far.min()
+    assert abs((near.max() + far.min()) / 2 - column) < 1.0
+
+
+def test_an_odd_rotation_of_rectified_color_is_refused(tmp_path: Path) -> None:
+    r = Ros(2)
+    for number, R in enumerate([np.full(9, 0.5), np.diag([1.0, 1.0, -1.0]).ravel()]):
+        color = r.info(START_NS, "rgb", SMALL)
+        color.r = R
+        infos = {"/rgb/camera_info": color, "/depth_to_rgb/camera_info": r.info(START_NS, "rgb", SMALL)}
+        rows = still(r, ("/rgb/image_rect_color", "rgb"), ("/depth_to_rgb/image_raw", "rgb"), infos)
+        log = r.write(tmp_path / f"bag{number}", rows, "sqlite3")
+        with pytest.raises(DuagError, match=r"R is \[.*, expected a rotation"):
+            registry.convert("ros", log, tmp_path / "rec")
 
 
 def test_depth_that_says_it_has_no_distortion_is_not_undistorted(tmp_path: Path) -> None:
