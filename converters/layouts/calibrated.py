@@ -35,7 +35,8 @@ def is_pinhole(lens: Lens) -> bool:
     Args:
         lens: the color camera.
     """
-    return lens.source.fx == lens.source.fy and not any(lens.distortion) and not any(lens.rotation_rad)
+    is_bent = lens.fisheye or any(lens.distortion) or any(lens.rotation_rad)
+    return lens.source.fx == lens.source.fy and not is_bent
 
 
 def square_camera(lens: Lens) -> PinholeCamera:

@@ -89,9 +89,10 @@ class RosCamera:
             (cx - roi.x_offset + 0.5) / binning[0] - 0.5,
             (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
         )
-        if not np.any(D):
-            return RosCamera(camera, (), False, frame, len(D) > 0, tuple(R.tolist()), rectified)
         fisheye = model in FISHEYE
+        # by four zeros a fisheye is still one: the distance from the center is the angle
+        if not np.any(D) and not (fisheye and len(D) >= min(FISHEYE_NUMBERS)):
+            return RosCamera(camera, (), False, frame, len(D) > 0, tuple(R.tolist()), rectified)
         if fisheye:  # of four numbers, but drivers of RealSense send the five of their structure
             D = np.concatenate([D[:4], np.trim_zeros(D[4:], "b")])
         lengths = FISHEYE_NUMBERS if fisheye else POLYNOMIAL_NUMBERS

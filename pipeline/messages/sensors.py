@@ -157,22 +157,23 @@ def unpack_camera(m: Any) -> tuple[PinholeCamera, Lens | None]:
     source = _pinhole(m, numbers(m.K, (3, 3), "K"), "K")
     turn = numbers(m.R, (3, 3), "R") if any(m.R) else np.eye(3)
     P = numbers(m.P, (3, 4), "P") if any(m.P) or any(m.D) else np.hstack([source.matrix(), np.zeros((3, 1))])
-    if not any(m.D) and np.array_equal(turn, np.eye(3)) and np.array_equal(P[:, :3], source.matrix()):
+    D, fisheye = tuple(float(d) for d in m.D), m.distortion_model == FISHEYE
+    is_bent = any(D) or (fisheye and len(D) > 0)  # a fisheye whose numbers are 0 is no pinhole
+    if not is_bent and np.array_equal(turn, np.eye(3)) and np.array_equal(P[:, :3], source.matrix()):
         return source, None
     if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6 or np.linalg.det(turn) < 0:
         raise DuagError(f"R is {turn.ravel().tolist()}, expected a rotation")
     if np.any(P[:, 3]):
         raise DuagError(f"P is {P.ravel().tolist()}, expected a camera at the place of K")
-    D, fisheye = tuple(float(d) for d in m.D), m.distortion_model == FISHEYE
     lengths = FISHEYE_NUMBERS if fisheye else POLYNOMIAL_NUMBERS
     known = m.distortion_model in (FISHEYE, PLUMB_BOB, RATIONAL) and len(D) in lengths
-    if any(D) and not (known and np.isfinite(D).all()):
+    if is_bent and not (known and np.isfinite(D).all()):
         raise DuagError(
             f"found lens distortion {m.distortion_model!r} {list(D)}, expected {PLUMB_BOB!r}, {RATIONAL!r} or "
             f"{FISHEYE!r} and finite numbers as OpenCV has them"
         )
     x, y, z = so3.log(turn.T).tolist()
-    lens = Lens(source, D if any(D) else (), fisheye and any(D), (x, y, z))
+    lens = Lens(source, D if is_bent else (), fisheye and is_bent, (x, y, z))
     return _pinhole(m, P[:, :3], "P"), lens
 
 

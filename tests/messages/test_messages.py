@@ -203,6 +203,7 @@ CAMERA = PinholeCamera(7, 5, 3.5, 3.25, 2.9, 2.1)
         (Lens(PinholeCamera(7, 5, 4.0, 3.0, 3.0, 2.0), (0.1, -0.2, 0.0, 0.0)), "plumb_bob"),
         (Lens(CAMERA, (0.1, -0.2, 0.0, 0.0, 0.3, 0.4, 0.5, 0.6)), "rational_polynomial"),
         (Lens(CAMERA, (0.1, -0.2, 0.0, 0.0), fisheye=True), "kannala_brandt"),
+        (Lens(CAMERA, (0.0, 0.0, 0.0, 0.0), fisheye=True), "kannala_brandt"),
         (Lens(CAMERA, (), rotation_rad=(0.01, -0.02, 0.03)), ""),
         (Lens(PinholeCamera(7, 5, 4.0, 3.0, 3.0, 2.0)), ""),
     ],

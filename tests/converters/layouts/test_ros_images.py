@@ -64,6 +64,21 @@ def test_drivers_may_send_a_fifth_number_of_a_fisheye_that_is_zero() -> None:
     assert cameras[0] == cameras[1]
 
 
+def test_a_fisheye_whose_numbers_are_zero_is_no_pinhole() -> None:
+    info = Ros(2).info(1, "c", COLOR)
+    object.__setattr__(info, "distortion_model", "equidistant")
+    object.__setattr__(info, "d", np.zeros(4))
+    camera = RosCamera.of(info, False, "here")
+    maps = camera.maps()
+    assert maps is not None
+    assert not camera.is_straight
+    x, y = COLOR.rays()[0, 0, :2]  # of a corner: its distance from the center is its angle
+    angle = np.arctan(np.hypot(x, y))
+    expected = COLOR.project(np.array([x, y, np.hypot(x, y) / angle]))
+    np.testing.assert_allclose([maps[0][0, 0], maps[1][0, 0]], expected, atol=1e-3)
+    assert RosCamera.of(info, True, "here").maps() is None
+
+
 def gray_card() -> np.ndarray:
     rng = np.random.default_rng(0)
     return cv2.GaussianBlur(rng.integers(0, 256, (12, 16, 3)).astype(np.uint8), (5, 5), 0)
