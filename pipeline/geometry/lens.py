@@ -15,6 +15,8 @@ Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Column and row in a source at which every pixel of an image lies, [h, w] each, as `cv2.remap` takes them."""
 FISHEYE_NUMBERS = (4,)
 POLYNOMIAL_NUMBERS = (4, 5, 8, 12, 14)
+OUTSIDE = np.float32(-1)  # column and row of what no pixel of the source shows
+TURN_STEPS = 4096  # of the radius, by which it is found where a distortion turns back
 ROUNDING_STEPS = 2  # of float32 at the far border, by which maps may be off
 
 
@@ -57,7 +59,27 @@ class Lens:
                 rays, turned, np.zeros(3), self.source.matrix(), np.array(lens or np.zeros(4))
             )
         u, v = pixels.reshape(camera.height, camera.width, 2).astype(np.float32).transpose(2, 0, 1)
-        return np.ascontiguousarray(u), np.ascontiguousarray(v)
+        beyond = self._beyond_the_turn(rays.reshape(-1, 3) @ self.rotation().T).reshape(u.shape)
+        return np.where(beyond, OUTSIDE, u), np.where(beyond, OUTSIDE, v)
+
+    def _beyond_the_turn(self, rays: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Rays [n, 3] so far from the axis that the distortion leads back towards it: no pixel shows them."""
+        across, ahead = np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]
+        behind = (ahead <= 0) & (not self.fisheye)
+        radius = np.arctan2(across, ahead) if self.fisheye else across / np.where(behind, 1.0, ahead)
+        k = np.zeros(8)
+        k[: min(8, len(self.distortion))] = self.distortion[:8]
+        r = np.linspace(0.0, float(radius.max()), TURN_STEPS)
+        s = r * r
+        if self.fisheye:
+            distorted = r * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
+        else:  # the tangential and the prism terms are small
+            above, below = ((1 + s * (a + s * (b + s * c))) for a, b, c in (k[[0, 1, 4]], k[5:8]))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                distorted = r * above / below
+        with np.errstate(invalid="ignore"):
+            back = np.flatnonzero(np.diff(distorted) <= 0)
+        return behind | (radius > (r[back[0]] if len(back) else np.inf))
 
 
 def rectified(image: NDArray[np.uint8], maps: Maps) -> NDArray[np.uint8]:

@@ -63,3 +63,31 @@ def test_beyond_the_border_the_border_is_repeated() -> None:
     maps = Lens(CAMERA, (0.4, 0.0, 0.0, 0.0)).maps(CAMERA)
     assert not seen_by_source(maps, 64, 48).all()
     assert (rectified(np.full((48, 64, 3), 200, np.uint8), maps) == 200).all()
+
+
+@pytest.mark.parametrize(
+    ("distortion", "fisheye", "turn"),
+    [
+        ((-0.25, 0.0, 0.0, 0.0), False, np.sqrt(1 / 0.75)),  # where 1 - 3 * 0.25 r^2 = 0
+        ((-0.2, 0.0, 0.0, 0.0), True, np.tan(np.sqrt(1 / 0.6))),
+        ((0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0), False, np.sqrt(2.0)),  # r / (1 + r^2 / 2)
+        ((-0.05, 0.004, 0.0, 0.0), False, np.inf),
+    ],
+)
+def test_what_lies_beyond_the_turn_of_a_distortion_is_not_seen(
+    distortion: tuple[float, ...], fisheye: bool, turn: float
+) -> None:
+    """The polynomial leads back into the image there, and the image would be seen twice."""
+    wide = PinholeCamera(200, 150, 25.0, 25.0, 99.5, 74.5)
+    source = PinholeCamera(400, 300, 40.0, 40.0, 199.5, 149.5)
+    lens = Lens(source, distortion, fisheye=fisheye)
+    rays = wide.rays()
+    radius = np.hypot(rays[..., 0], rays[..., 1])
+    seen = seen_by_source(lens.maps(wide), source.width, source.height)
+    near = radius < 0.99 * turn
+    assert near.any()
+    assert not seen[radius > 1.01 * turn].any()
+    pixels = np.stack(lens.maps(wide), axis=-1)[near]
+    inside = ((pixels >= 0) & (pixels <= [source.width - 1, source.height - 1])).all(axis=-1)
+    assert inside.mean() > 0.3
+    assert np.array_equal(seen[near], inside)
