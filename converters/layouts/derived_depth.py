@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.layouts.ros_images import color_bytes
+from duagc.converters.layouts.ros_images import UnusableImage, color_bytes
 from duagc.converters.layouts.ros_points import PointTimes, as_of, points_of
 from duagc.converters.layouts.stereo import RowCheck, StereoRig
 from duagc.converters.logs.entries import Entry
@@ -57,7 +57,7 @@ def decoded(message: Any, where: str) -> Image:
     data, _ = color_bytes(message, where)
     image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise DuagError(f"{where}: {len(data)} bytes that no decoder reads, expected an image")
+        raise UnusableImage(f"{where}: {len(data)} bytes that no decoder reads, expected an image")
     return np.asarray(image, dtype=np.uint8)
 
 
@@ -83,10 +83,18 @@ class StereoFrames:
         return self.rig.rectify_left(first), self.rig.rectify_right(second)
 
     def check_rows(self, pairs: Iterable[tuple[Any, Any]], where: str) -> dict[str, Any]:
-        """The test of the rectification on some pairs of messages; see `RowCheck`."""
-        check = RowCheck()
+        """The test of the rectification on some pairs of messages, broken ones left out; see `RowCheck`."""
+        check, broken, sound = RowCheck(), list[UnusableImage](), 0
         for left, right in pairs:
-            check.add(*(gray(image) for image in self.rectified(left, right, where)))
+            try:
+                images = self.rectified(left, right, where)
+            except UnusableImage as error:
+                broken.append(error)
+                continue
+            check.add(*(gray(image) for image in images))
+            sound += 1
+        if broken and not sound:
+            raise broken[0]
         return check.result(where)
 
     def frame(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -56,8 +57,14 @@ def calibrated(info: Any, R: np.ndarray, P: np.ndarray) -> Any:
     return info
 
 
-def stereo_log(folder: Path, stated: str) -> Path:
-    """A bag of a pair. stated: how ("p", "rect", "tf", "option", "wrong", "none") the right camera's place is."""
+def stereo_log(folder: Path, stated: str, broken: Mapping[int, bytes] | None = None) -> Path:
+    """A bag of a pair.
+
+    Args:
+        folder: for the log.
+        stated: how ("p", "rect", "tf", "option", "wrong", "none") the right camera's place is.
+        broken: by number of the frame, what is recorded instead of the right image; all are compressed then.
+    """
     r = Ros(2)
     D = [(*D_LEFT, 0.0), (*D_RIGHT, 0.0)]
     size = (LEFT.width, LEFT.height)
@@ -86,8 +93,15 @@ def stereo_log(folder: Path, stated: str) -> Path:
             images = [rig.rectify_left(images[0]), rig.rectify_right(images[1])]
         for side, frame, image in zip(("left", "right"), "lr", images, strict=True):
             late = 0 if side == "left" else 1_000_000
-            message = r.image(at + late, frame, image, "rgb8")
-            rows.append((f"/eyes/{side}/{name}", at + 5_000_000 + late, message))
+            message, topic = r.image(at + late, frame, image, "rgb8"), f"/eyes/{side}/{name}"
+            if broken is not None:
+                data = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+                data = broken.get(k, data) if side == "right" else data
+                message, topic = (
+                    r.compressed(at + late, frame, data, "rgb8; png compressed bgr8"),
+                    f"{topic}/compressed",
+                )
+            rows.append((topic, at + 5_000_000 + late, message))
         rows.append(("/odom", at + 6_000_000, odometry(r, at, "l", T)))
     return r.write(folder / stated, rows, "sqlite3")
 
@@ -116,6 +130,19 @@ def test_a_stereo_pair(tmp_path: Path, stated: str) -> None:
     stated_poses = [record.proto() for record in read_log(groundtruth) if "pose" in record.topic]
     for found, T in zip(stated_poses, poses(), strict=True):
         np.testing.assert_allclose(messages.unpack_pose_in_frame(found), T @ turn, atol=1e-6)
+
+
+def test_broken_images_of_a_pair_cost_themselves(tmp_path: Path) -> None:
+    """Also among the pairs by which the rectification is tested."""
+    options = ["depth_from=stereo", "min_depth_m=1.5", "max_relative_sigma=0.1"]
+    no_jpeg = b"\xff\xd8\xff\xe0" + b"\x55" * 400 + b"\xff\xd9"
+    log = stereo_log(tmp_path, "p", {0: no_jpeg, 2: b"\x89PNG"})
+    registry.convert("ros", log, tmp_path / "rec", options=options)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as found:
+        assert len(found) == FRAMES - 2
+    log = stereo_log(tmp_path, "tf", dict.fromkeys(range(FRAMES), no_jpeg))
+    with pytest.raises(DuagError, match="406 bytes of rgb8, expected an image"):
+        registry.convert("ros", log, tmp_path / "rec2", options=options)
 
 
 def test_a_pair_whose_rows_do_not_meet_is_refused(tmp_path: Path) -> None:
