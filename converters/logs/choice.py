@@ -80,7 +80,7 @@ class Chooser:
 
     def color(self) -> Choice:
         """Images that are not depth, and are not named so."""
-        found = [t for t, m in self.images.items() if not is_depth(m) and "depth" not in t.lower()]
+        found = [t for t, m in self.images.items() if not is_depth(m) and not self._is_named_depth(t)]
         left = LEFT if self._wanted.get("depth_from") == "stereo" else ()
         choice = self._one("color", found, (*left, "color", "rgb"))
         return (
@@ -98,7 +98,7 @@ class Chooser:
         if source == "stereo":
             left = self.color().topic
             others = [t for t, m in self.images.items() if t != left and not is_depth(m)]
-            return self._one("depth", [t for t in others if "depth" not in t.lower()], RIGHT, "right")
+            return self._one("depth", [t for t in others if not self._is_named_depth(t)], RIGHT, "right")
         if source == "lidar":
             if not self.clouds:
                 return Choice("", f"no topic holds {POINTS_TYPE}{packet_words(self.log, self.namespace)}")
@@ -106,7 +106,7 @@ class Chooser:
         found = [t for t, m in self.images.items() if is_depth(m)]
         sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
         choice = self._one("depth", sure or found, REGISTERED)
-        lost = [t for t, m in self.images.items() if "depth" in t.lower() and not is_depth(m)]
+        lost = [t for t, m in self.images.items() if self._is_named_depth(t) and not is_depth(m)]
         if not choice.topic and not choice.candidates and self.clouds:
             choice = replace(choice, why=f"{choice.why}, but there are points (depth_from=lidar)")
         elif not choice.topic and not choice.candidates:
@@ -136,6 +136,17 @@ class Chooser:
                 return Choice("", f"{image_topic} has CameraInfo on no topic", expected=stated)
             return Choice("", f"{image_topic} has CameraInfo on {', '.join(self.infos)}", tuple(self.infos))
         return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
+
+    def _is_named_depth(self, topic: str) -> bool:
+        """Whether a topic is named as depth; the name of a sensor of both (/depth_cam/rgb) does not count."""
+        names, parts = [topic.lower()], PurePosixPath(topic.lower()).parts
+        for other in (t.lower() for t, m in self.images.items() if is_depth(m)):
+            others = PurePosixPath(other).parts
+            same = [a == b for a, b in zip(parts, others, strict=False)]
+            shared = [*same, False].index(False)
+            if any("depth" in part for part in others[shared:]):
+                names.append("/".join(parts[shared:]))
+        return all("depth" in name for name in names)
 
     def _one(
         self,

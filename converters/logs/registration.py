@@ -125,7 +125,7 @@ def extrinsics(
         return None
     if s.T_color_depth:
         return extrinsics_of("T_color_depth", s.T_color_depth)
-    color_frame, depth_frame = color.camera.frame_id, depth.camera.frame_id
+    color_frame, depth_frame = _frames(color, depth)
     if color_frame == depth_frame and _differ(color.frame, depth.frame):
         color_frame, depth_frame = color.frame, depth.frame
     T = (
@@ -168,10 +168,17 @@ def body_axes_of_cameras(color_frame: str, depth_frame: str, T_color_depth: Arra
 
 def _is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
     a, b = color.camera, depth.camera
-    one_frame = a.frame_id == b.frame_id != "" and not _differ(color.frame, depth.frame)
+    color_frame, depth_frame = _frames(color, depth)
+    one_frame = color_frame == depth_frame != "" and not _differ(color.frame, depth.frame)
     if a.camera == b.camera and one_frame:
         return True
     return is_named_registered(depth.topic) and (one_frame or _agree(a.camera, b.camera))
+
+
+def _frames(*views: ImageTopic) -> list[str]:
+    """Frames by CameraInfo; where only some have one, those of the images stand in for the others."""
+    stated = [view.camera.frame_id for view in views]
+    return [frame or view.frame for frame, view in zip(stated, views, strict=True)] if any(stated) else stated
 
 
 def _differ(a: str, b: str) -> bool:

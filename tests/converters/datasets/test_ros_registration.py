@@ -135,6 +135,36 @@ def test_unregistered_depth_is_not_chosen_for_its_name(tmp_path: Path) -> None:
     assert len(choice.candidates) == 2
 
 
+@pytest.mark.parametrize(
+    ("color", "depth", "found"),
+    [
+        ("/depth_cam/rgb/image_raw", "/depth_cam/depth_registered/image_raw", True),
+        ("/robot/depth_camera/color", "/robot/depth_camera/depth", True),
+        ("/camera/depth/image_preview", "/camera/depth/image_raw", False),
+        ("/depth_cam/depth_preview/image_raw", "/depth_cam/depth/image_raw", False),
+    ],
+)
+def test_a_sensor_named_for_its_depth_has_color(tmp_path: Path, color: str, depth: str, found: bool) -> None:
+    r = Ros(2)
+    with open_log([r.write(tmp_path / "bag", still(r, (color, "c"), (depth, "c")), "sqlite3")]) as log:
+        chooser = Chooser(log)
+        assert chooser.depth().topic == depth
+        assert chooser.color().topic == (color if found else "")
+
+
+def test_a_camera_info_without_a_frame_has_that_of_its_images(tmp_path: Path) -> None:
+    r, T = Ros(2), se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 0.5])
+    infos = {
+        "/rgb/camera_info": r.info(START_NS, "c", SMALL),
+        "/depth/camera_info": r.info(START_NS, "", SMALL),
+    }
+    rows = still(r, ("/rgb/image_raw", "c"), ("/depth/image_raw", "d"), infos)
+    tie = "/tf_static", START_NS, r.tf(r.transform(START_NS, "c", "d", T))
+    registry.convert("ros", r.write(tmp_path / "bag", [tie, *rows], "sqlite3"), tmp_path / "rec")
+    depth, _ = first(tmp_path / "rec")
+    assert set(np.round(np.unique(depth[depth > 0]), 3)) == {1.5, 2.5}
+
+
 def test_depth_with_a_lens_of_its_own_fits_rectified_color(tmp_path: Path) -> None:
     """Color is rectified by name; the CameraInfo of the registered depth says that it is not."""
     r = Ros(2)
