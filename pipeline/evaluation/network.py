@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.component_names import robot_of, same_robot
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.evaluation.oracle import NO_MATCHES, gap_to_oracle, matches_among
+from duagc.pipeline.evaluation.oracle import NO_MATCHES, gap_to_oracle, matches_among, never_weighted
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.recording import Record, read_log
@@ -211,10 +211,10 @@ class Session:
         return self._log("consensus.mcap", topics.LOOP_CLOSURE_DECISION)
 
     def loop_closure_counts(self) -> dict[str, int]:
-        """Inter-robot loop closures that are inliers in the end, and measured candidates that are not."""
-        kept = sum(is_inlier(decision) for decision in self.loop_closures)
-        tried = sum(is_inlier(decision) or measured(decision) for decision in self.loop_closures)
-        return {"inter_robot_loop_closures": kept, "inter_robot_loop_closures_rejected": tried - kept}
+        """Inter-robot loop closures that are inliers in the end, and measured candidates that were rejected."""
+        kept = [is_inlier(d) for d in self.loop_closures]
+        rejected = [measured(d) and not (is_inlier(d) or never_weighted(d)) for d in self.loop_closures]
+        return {"inter_robot_loop_closures": sum(kept), "inter_robot_loop_closures_rejected": sum(rejected)}
 
     @cached_property
     def pairs(self) -> dict[tuple[str, str], NDArray[np.int64]]:

@@ -41,6 +41,7 @@ from duagc.schemas import topics
 NO_TEAM = Absent("no two robots share a world")
 NO_MATCHES = Absent("no Gaussians were matched")
 NO_INFORMATION = Absent("consensus.mcap does not hold the information of the closures")
+NO_WEIGHTS = Absent("contact ended before all loop closures that were kept had a weight")
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,15 @@ class Gap:
     radians: float
     sigma: float | Absent
     sigma_p99: float | Absent
+
+
+def never_weighted(decision: Any) -> bool:
+    """Whether a loop closure was kept, but contact ended before the poses gave it a weight.
+
+    Args:
+        decision: a duagc.v1.LoopClosureDecision.
+    """
+    return bool(decision.verdict == "kept" and decision.weight < 0)
 
 
 def gap_to_oracle(
@@ -241,7 +251,11 @@ def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[HeldLoop
     """The closures between members that took part, in order of the log."""
     out = []
     for d in decisions:
-        if d.weight < 0 or d.robot not in members or d.peer not in members:
+        if d.robot not in members or d.peer not in members:
+            continue
+        if never_weighted(d):
+            return NO_WEIGHTS
+        if d.weight < 0:
             continue
         if len(d.information) != 36:
             return NO_INFORMATION

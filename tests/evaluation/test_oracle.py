@@ -5,7 +5,8 @@ import pytest
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.pose_admm import with_floor
-from duagc.pipeline.evaluation.oracle import gap_to_oracle, pose_gap, solve_component
+from duagc.pipeline.evaluation.network import Session
+from duagc.pipeline.evaluation.oracle import NO_WEIGHTS, Gap, gap_to_oracle, pose_gap, solve_component
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
@@ -78,6 +79,18 @@ def test_without_information_or_company_there_is_no_gap(tmp_path):
     found = gap_to_oracle(apart, [], {})
     assert isinstance(found, Absent)
     assert "share" in found.reason
+
+
+def test_a_kept_closure_that_the_poses_never_had_is_no_rejected_one_and_leaves_no_gap(tmp_path):
+    session = Session(RunFolder(make(tmp_path).run))
+    assert isinstance(gap_to_oracle(session.run, session.loop_closures, session.pairs), Gap)
+    before = session.loop_closure_counts()
+    for decision in session.loop_closures:
+        decision.weight = -1.0 if decision.verdict == "kept" else decision.weight
+    assert gap_to_oracle(session.run, session.loop_closures, session.pairs) == NO_WEIGHTS
+    after = session.loop_closure_counts()
+    assert (before["inter_robot_loop_closures"], after["inter_robot_loop_closures"]) == (1, 0)
+    assert before["inter_robot_loop_closures_rejected"] == after["inter_robot_loop_closures_rejected"] == 2
 
 
 def test_the_floor_is_that_of_the_agents():
