@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.evidence import rows_by_id
 from duagc.pipeline.evaluation import groundtruth, trajectory_errors
+from duagc.pipeline.evaluation.oracle import NO_LISTS, NO_MATCHES, unlisted
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.true_paths import TruePaths
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RunFolder
-
-NO_PAIRS = Absent("no Gaussians were matched")
 
 
 def matching_section(
@@ -38,6 +37,8 @@ def matching_section(
     surface = groundtruth.surface(source)
     if isinstance(surface, Absent):
         return dict.fromkeys(names, surface)
+    if unlisted([robot.component for robot in run.robots.values()], pairs):
+        return dict.fromkeys(names, NO_LISTS)
     points, ids = dict[str, Array](), dict[str, NDArray[np.int64]]()
     for name in sorted({name for pair in pairs for name in pair}):
         path = truth.before[name]
@@ -55,7 +56,7 @@ def matching_section(
         found += len(matched)
         right += int(np.count_nonzero(np.sum(apart**2, axis=1) <= radius_m**2))
         possible += _have_one_near(points[lower], points[higher], radius_m)
-    values = [right / whole if whole else NO_PAIRS for whole in (found, possible)]
+    values = [right / whole if whole else NO_MATCHES for whole in (found, possible)]
     return dict(zip(names, values, strict=True))
 
 

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.component_names import robot_of, same_robot
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.evaluation.oracle import NO_MATCHES, gap_to_oracle, matches_among, never_weighted
+from duagc.pipeline.evaluation.oracle import (
+    NO_LISTS,
+    NO_MATCHES,
+    gap_to_oracle,
+    matches_among,
+    never_weighted,
+    unlisted,
+    used_matches,
+)
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.recording import Record, read_log
@@ -231,9 +239,14 @@ class Session:
         names = sorted(self.run.robots)
         return {(names[a], names[b]): newest[a, b].ids for a, b in sorted(newest)}
 
-    def matched_pairs(self) -> int:
+    @cached_property
+    def unlisted_pairs(self) -> set[tuple[str, str]]:
+        """Pairs of robots that share a world, but of whose matches no list was sent."""
+        return unlisted([robot.component for robot in self.run.robots.values()], self.pairs)
+
+    def matched_pairs(self) -> int | Absent:
         """Pairs of matched Gaussians over all pairs of robots."""
-        return sum(len(ids) for ids in self.pairs.values())
+        return NO_LISTS if self.unlisted_pairs else sum(len(ids) for ids in self.pairs.values())
 
     @cached_property
     def summary(self) -> Any:
@@ -255,6 +268,7 @@ class Session:
         robot_pairs = len({frozenset(map(robot_of, (link.sender, link.receiver))) for link in self.links})
         sent = int(p.size_bytes.sum())
         per_pair = sent / (ticks * robot_pairs) if ticks * robot_pairs else NO_EXCHANGE
+        paper = matched if isinstance(matched, Absent) else matched * PAPER_BYTES_PER_PAIR * ticks
         return {
             "sessions": 1,
             "rounds": ticks,
@@ -267,7 +281,7 @@ class Session:
             "bytes_per_round_per_robot_pair": per_pair,
             "bytes_raw_alternative": self.summary.bytes_raw_alternative,
             "bytes_raw_alternative_maps_only": self.summary.bytes_raw_alternative_maps_only,
-            "bytes_paper_accounting": matched * PAPER_BYTES_PER_PAIR * ticks,
+            "bytes_paper_accounting": paper,
             "matched_pairs": matched,
         }
 
@@ -303,11 +317,12 @@ class Session:
 
     def rejected_matches_share(self) -> float | Absent:
         """Share of the matches of each robot's component that the robot did not use; all robots together."""
+        if self.unlisted_pairs:
+            return NO_LISTS
         robots = self.run.robots.values()
         matches = sum(len(ids) for r in robots for ids in matches_among(r.component, self.pairs).values())
-        if not matches:
-            return NO_MATCHES
-        return sum(len(ids) for r in robots for ids in r.rejected_matches.values()) / matches
+        used = sum(len(ids) for r in robots for ids in used_matches(r, self.pairs).values())
+        return (matches - used) / matches if matches else NO_MATCHES
 
     @property
     def period_ns(self) -> int:

@@ -9,8 +9,9 @@ session that the robot used. Only who computes differs: a match that a robot's o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ NO_TEAM = Absent("no two robots share a world")
 NO_MATCHES = Absent("no Gaussians were matched")
 NO_INFORMATION = Absent("consensus.mcap does not hold the information of the closures")
 NO_WEIGHTS = Absent("contact ended before all loop closures that were kept had a weight")
+NO_LISTS = Absent("contact ended before the lists of matches were sent")
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,8 @@ class Gap:
     """Largest difference of a keyframe pose from the centralized answer: meters, radians.
 
     sigma, sigma_p99: of the coordinates of matched Gaussians in their standard deviations, the largest and the 99th
-    percentile of each Gaussian's largest; absent where nothing was matched. The largest shows fusion's own
-    decisions: where members contradict each other, rounding on the wire may tip them.
+    percentile of each Gaussian's largest; absent where nothing was matched, or robots matched without a list. The
+    largest shows fusion's own decisions: where members contradict each other, rounding on the wire may tip them.
     """
 
     meters: float
@@ -109,6 +111,8 @@ def gap_to_oracle(
 
 
 def _largest(values: Sequence[float | Absent]) -> float | Absent:
+    if NO_LISTS in values:
+        return NO_LISTS
     return max((v for v in values if not isinstance(v, Absent)), default=NO_MATCHES)
 
 
@@ -122,6 +126,8 @@ def _gap(
 ) -> Gap:
     """The gap of one component whose centralized poses are known."""
     meters, radians = pose_gap(poses, central)
+    if unlisted([members], pairs):
+        return Gap(meters, radians, NO_LISTS, NO_LISTS)
     weights = run.config.exchange.weights
     evidence = {
         name: in_world(shared_evidence(*_map_of(run.robots[name]), kind=weights), central[name], weights)
@@ -141,6 +147,18 @@ def _gap(
 
 
 Pairs = Mapping[tuple[str, str], NDArray[np.int64]]
+
+
+def unlisted(components: Iterable[Sequence[str]], pairs: Pairs) -> set[tuple[str, str]]:
+    """Pairs of robots that share a world without a list of their matches: contact ended before one was sent.
+
+    Such robots match what they have by themselves, and no message says what.
+
+    Args:
+        components: of robots, names in order.
+        pairs: ids of matched Gaussians [n, 2] by robots.
+    """
+    return {pair for members in components for pair in combinations(members, 2)} - set(pairs)
 
 
 def matches_among(members: Sequence[str], pairs: Pairs) -> Pairs:

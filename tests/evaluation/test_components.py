@@ -91,7 +91,7 @@ def test_pixels_are_of_frames_of_the_component(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_components_of_a_robot_and_a_peer_are_one_pair() -> None:
-    session = Session(SimpleNamespace(robots=dict.fromkeys(NAMES)))
+    session = Session(SimpleNamespace(robots={name: SimpleNamespace(component=(name,)) for name in NAMES}))
     text, number = np.array(["x", "x"]), np.array([0, 1])
     session.__dict__ |= {
         "packets": Packets(number, text, text, text, np.array([300, 500]), np.array([True, True]), 2),

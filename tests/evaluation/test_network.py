@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from duagc.pipeline.base.component_names import same_robot
@@ -27,8 +28,10 @@ ELIMINATION = ExchangeConfig(solver="elimination")
 
 def met(folder: Path, config: ExchangeConfig, data: list[RobotData]) -> network.Session:
     paths = {"exchange_path": folder / "exchange.mcap", "consensus_path": folder / "consensus.mcap"}
-    run_session_of(data, config, seed=0, **paths)
-    robots = dict.fromkeys(d.robot for d in data)
+    results = run_session_of(data, config, seed=0, **paths)
+    robots = {
+        name: SimpleNamespace(component=r.component, rejected_matches={}) for name, r in results.items()
+    }
     return network.Session(SimpleNamespace(path=folder, robots=robots))  # type: ignore[arg-type]
 
 
@@ -94,6 +97,32 @@ def test_a_robot_that_ends_alone_needs_no_rounds(monkeypatch: pytest.MonkeyPatch
     late = ticks(rounds[:-1])
     assert isinstance(late, Absent)
     assert late.reason == "charlie did not get there in 10 rounds"
+
+
+def test_matches_without_a_list_are_not_counted(tmp_path: Path) -> None:
+    """Contact ends before the lists are sent: the robots match by themselves, and no message says what."""
+    data = [robot(name, 0.3 * i, keyframes=3, gaussians=40)[0] for i, name in enumerate(("alpha", "bravo"))]
+    for rounds, matches in ((20, (network.NO_LISTS,) * 3), (ADMM.max_rounds, (0, 0, network.NO_MATCHES))):
+        (folder := tmp_path / str(rounds)).mkdir()
+        session = met(folder, ADMM.model_copy(update={"max_rounds": rounds}), data)
+        assert session.run.robots["alpha"].component == ("alpha", "bravo")
+        found = session.exchange_section()
+        share = session.rejected_matches_share()
+        assert (found["matched_pairs"], found["bytes_paper_accounting"], share) == matches
+
+
+def test_the_share_of_rejected_matches_is_of_the_lists() -> None:
+    """Bravo, which did not get the list, matched by itself, and rejected what nobody listed."""
+    ids = np.array([[1, 2], [3, 4], [5, 6]])
+    key, component = ("alpha", "bravo"), ("alpha", "bravo")
+    by_itself = np.array([[3, 4], *([k, k] for k in range(10, 30))])
+    rejected: dict[str, dict[tuple[str, str], Any]] = {"alpha": {}, "bravo": {key: by_itself}}
+    robots = {
+        name: SimpleNamespace(component=component, rejected_matches=of) for name, of in rejected.items()
+    }
+    session = network.Session(SimpleNamespace(robots=robots))  # type: ignore[arg-type]
+    session.__dict__["pairs"] = {key: ids}
+    assert session.rejected_matches_share() == 1 / 6
 
 
 def test_every_kind_of_message_of_a_run_has_a_purpose() -> None:

@@ -6,7 +6,14 @@ import pytest
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.evaluation.network import Session
-from duagc.pipeline.evaluation.oracle import NO_WEIGHTS, Gap, gap_to_oracle, pose_gap, solve_component
+from duagc.pipeline.evaluation.oracle import (
+    NO_LISTS,
+    NO_WEIGHTS,
+    Gap,
+    gap_to_oracle,
+    pose_gap,
+    solve_component,
+)
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
@@ -91,6 +98,14 @@ def test_a_kept_closure_that_the_poses_never_had_is_no_rejected_one_and_leaves_n
     after = session.loop_closure_counts()
     assert (before["inter_robot_loop_closures"], after["inter_robot_loop_closures"]) == (1, 0)
     assert before["inter_robot_loop_closures_rejected"] == after["inter_robot_loop_closures_rejected"] == 2
+
+
+def test_without_a_list_of_matches_there_is_a_gap_of_poses_alone(tmp_path):
+    session = Session(RunFolder(make(tmp_path).run))
+    listed = gap_to_oracle(session.run, session.loop_closures, session.pairs)
+    found = gap_to_oracle(session.run, session.loop_closures, {})
+    assert (found.meters, found.radians) == (listed.meters, listed.radians)
+    assert found.sigma == found.sigma_p99 == NO_LISTS != listed.sigma
 
 
 def test_the_floor_is_that_of_the_agents():

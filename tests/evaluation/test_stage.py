@@ -16,6 +16,7 @@ from duagc.pipeline.base.worker_reports import Step
 from duagc.pipeline.evaluation import evaluate, robot_measures, trajectory_errors
 from duagc.pipeline.evaluation import views as scored_views
 from duagc.pipeline.evaluation.matching_truth import matching_section
+from duagc.pipeline.evaluation.oracle import NO_LISTS
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.evaluation.true_paths import TruePaths
 from duagc.pipeline.experiments.own_longer import own_longer
@@ -306,6 +307,7 @@ def test_matches_are_right_where_both_means_are_of_one_true_place(fake):
     assert 0 < score(half)[1] <= 0.5
     wrong = np.stack([half[:, 0], np.roll(half[:, 1], len(half) // 2)], axis=1)
     assert max(score(wrong)) < 0.1
+    assert set(matching_section(run, source, truth, {}).values()) == {NO_LISTS}
 
 
 def test_without_ground_truth_there_are_reasons_not_numbers(tmp_path):
