@@ -295,7 +295,7 @@ class Session:
             "gap_to_oracle_rad": gap if isinstance(gap, Absent) else gap.radians,
         }
         last = {m.robot: m for m in self.agent_rounds}
-        together = {robot for robot, m in last.items() if len(m.members) > 1}
+        together = {robot for robot, m in last.items() if len({robot_of(name) for name in m.members}) > 1}
         agreed: dict[str, int] = {}
         for m in self.agent_rounds:
             if m.agreed:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
@@ -109,9 +110,11 @@ def team_error(pairs_of: Mapping[str, Paired]) -> TeamError | Absent:
     """Align all robots of a component with one SE(3) transform and pool their errors over all paired frames.
 
     Only a joint alignment sees the error between robots: each robot may lie well by itself and the team lie apart.
+    The components of a robot count as one.
     """
-    if len(pairs_of) < 2:
-        found = "none" if not pairs_of else "only " + ", ".join(sorted(pairs_of))
+    robots = sorted({robot_of(name) for name in pairs_of})
+    if len(robots) < 2:
+        found = f"only {robots[0]}" if robots else "none"
         return Absent(
             f"a joint alignment needs at least 2 robots with ground truth in one component, found {found}"
         )

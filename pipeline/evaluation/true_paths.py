@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.evaluation import groundtruth, trajectory_errors
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import Paired, TeamError
@@ -18,11 +19,15 @@ from duagc.pipeline.runs.folder import RunFolder
 
 @dataclass(frozen=True)
 class TruePaths:
-    """Estimates paired with ground truth, by robot: after and before consensus; and the joint alignment of the team."""
+    """Estimates paired with ground truth, by robot: after and before consensus; and the joint alignment of the team.
+
+    component_of: the robots that share a robot's world, itself among them, by its name.
+    """
 
     after: Mapping[str, Paired | Absent]
     before: Mapping[str, Paired | Absent]
     team: TeamError | Absent
+    component_of: Mapping[str, tuple[str, ...]]
 
     @staticmethod
     def of(run: RunFolder, source: Recording) -> TruePaths:
@@ -40,20 +45,21 @@ class TruePaths:
             before[name] = _paired(true, robot.odometry, rotations)
         known = {r: p for r in run.largest_component if not isinstance(p := after[r], Absent)}
         missing = [p for r in run.largest_component if isinstance(p := after[r], Absent)]
-        alone = len(run.largest_component) < 2
+        alone = len({robot_of(r) for r in run.largest_component}) < 2
         team = missing[0] if missing and not alone else trajectory_errors.team_error(known)
-        return TruePaths(after, before, team)
+        return TruePaths(after, before, team, {name: robot.component for name, robot in run.robots.items()})
 
     def T_gt_world(self, robot: str) -> NDArray[np.float64] | Absent:  # noqa: N802 (a transform)
-        """[4, 4]: the joint alignment for robots of the largest component, its own for any other robot.
+        """[4, 4]: the joint alignment of all robots with ground truth in the component of a robot that has it too.
 
         Args:
             robot: its name.
         """
-        if not isinstance(self.team, Absent) and robot in self.team.ate_rmse_m_of:
-            return self.team.T_gt_world
-        pairs = self.after[robot]
-        return pairs if isinstance(pairs, Absent) else trajectory_errors.alignment([pairs])
+        pairs, component = self.after[robot], self.component_of[robot]
+        if isinstance(pairs, Absent):
+            return pairs
+        members = [self.after[name] for name in sorted(self.after) if self.component_of[name] == component]
+        return trajectory_errors.alignment([p for p in members if not isinstance(p, Absent)])
 
 
 def _paired(true: Trajectory | Absent, estimated: Trajectory, rotations: bool) -> Paired | Absent:

@@ -97,6 +97,8 @@ def test_a_robot_that_ends_alone_needs_no_rounds(monkeypatch: pytest.MonkeyPatch
     late = ticks(rounds[:-1])
     assert isinstance(late, Absent)
     assert late.reason == "charlie did not get there in 10 rounds"
+    parts = ticks([seen(name, 8, "alpha alpha-2", agreed=True) for name in ("alpha", "alpha-2")])
+    assert parts == Absent("no two robots share a world")
 
 
 def test_matches_without_a_list_are_not_counted(tmp_path: Path) -> None:

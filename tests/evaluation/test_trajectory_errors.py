@@ -1,9 +1,12 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from duagc.pipeline.evaluation import trajectory_errors
+from duagc.pipeline.evaluation import groundtruth, trajectory_errors
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import Paired
+from duagc.pipeline.evaluation.true_paths import TruePaths
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import Trajectory, rpe_rmse
 
@@ -116,6 +119,43 @@ def test_a_team_of_one_has_no_joint_error():
     answer = trajectory_errors.team_error({"alpha": Paired(STAMPS, path, path)})
     assert isinstance(answer, Absent)
     assert "only alpha" in answer.reason
+
+
+def test_components_of_one_robot_are_no_team_but_share_one_alignment(monkeypatch):
+    """Charlie has no ground truth."""
+    ways = {
+        name: curved_path(seed=k)
+        for k, name in enumerate(("alpha", "alpha-2", "bravo", "bravo-3", "charlie"))
+    }
+
+    def true(source, name):
+        return Absent("none") if name == "charlie" else Trajectory(STAMPS, ways[name])
+
+    monkeypatch.setattr(groundtruth, "trajectory", true)
+    monkeypatch.setattr(groundtruth, "knows_rotations", lambda source, name: True)
+
+    def of(*components):
+        robots = {}
+        for component in components:
+            for name in component:  # the second of a component lies off by 0.3 m
+                T_world_true = se3.exp(np.array([0.3 * component.index(name), 0, 0, 0, 0, 0]))
+                path = Trajectory(STAMPS, T_world_true @ ways[name])
+                robots[name] = SimpleNamespace(trajectory=path, odometry=path, component=component)
+        return TruePaths.of(SimpleNamespace(robots=robots, largest_component=components[0]), None)
+
+    found = of(("alpha", "alpha-2"), ("bravo", "bravo-3"))
+    assert isinstance(found.team, Absent)
+    assert found.team.reason.endswith("only alpha")
+    for one, other in (("alpha", "alpha-2"), ("bravo", "bravo-3")):
+        both = trajectory_errors.alignment([found.after[one], found.after[other]])
+        assert np.array_equal(found.T_gt_world(one), both)
+        assert np.array_equal(found.T_gt_world(other), both)
+    met = of(("alpha", "alpha-2", "bravo"), ("bravo-3",))
+    assert sorted(met.team.ate_rmse_m_of) == ["alpha", "alpha-2", "bravo"]
+    assert np.array_equal(met.T_gt_world("alpha-2"), met.team.T_gt_world)
+    unknown = of(("alpha", "charlie"))
+    assert unknown.team == unknown.T_gt_world("charlie") == Absent("none")
+    assert np.allclose(unknown.T_gt_world("alpha"), np.eye(4))
 
 
 def test_true_positions_without_rotations_say_nothing_about_steps() -> None:
