@@ -215,13 +215,14 @@ class Session:
 
     @cached_property
     def loop_closures(self) -> list[Any]:
-        """Every duagc.v1.LoopClosureDecision, in order of the log: inter-robot candidates and their verdicts."""
+        """Every duagc.v1.LoopClosureDecision, in order of the log: candidates and their verdicts."""
         return self._log("consensus.mcap", topics.LOOP_CLOSURE_DECISION)
 
     def loop_closure_counts(self) -> dict[str, int]:
         """Inter-robot loop closures that are inliers in the end, and measured candidates that were rejected."""
-        kept = [is_inlier(d) for d in self.loop_closures]
-        rejected = [measured(d) and not (is_inlier(d) or never_weighted(d)) for d in self.loop_closures]
+        between = [d for d in self.loop_closures if not same_robot(d.robot, d.peer)]
+        kept = [is_inlier(d) for d in between]
+        rejected = [measured(d) and not (is_inlier(d) or never_weighted(d)) for d in between]
         return {"inter_robot_loop_closures": sum(kept), "inter_robot_loop_closures_rejected": sum(rejected)}
 
     @cached_property
@@ -245,8 +246,10 @@ class Session:
         return unlisted([robot.component for robot in self.run.robots.values()], self.pairs)
 
     def matched_pairs(self) -> int | Absent:
-        """Pairs of matched Gaussians over all pairs of robots."""
-        return NO_LISTS if self.unlisted_pairs else sum(len(ids) for ids in self.pairs.values())
+        """Pairs of matched Gaussians over all pairs of robots; components of one robot are no pair."""
+        if not all(same_robot(*pair) for pair in self.unlisted_pairs):
+            return NO_LISTS
+        return sum(len(ids) for pair, ids in self.pairs.items() if not same_robot(*pair))
 
     @cached_property
     def summary(self) -> Any:

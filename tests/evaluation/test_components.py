@@ -8,6 +8,7 @@ import pytest
 
 from duagc.pipeline.evaluation import evaluate, pixel_errors
 from duagc.pipeline.evaluation.network import Link, Packets, Session
+from duagc.pipeline.evaluation.oracle import NO_LISTS
 from duagc.pipeline.evaluation.rendering import RenderTask, mates
 from duagc.pipeline.geometry.trajectory import Trajectory, read_tum, write_tum
 from duagc.pipeline.report.page import write_report
@@ -88,6 +89,29 @@ def test_pixels_are_of_frames_of_the_component(monkeypatch: pytest.MonkeyPatch, 
     source = SimpleNamespace(log=lambda name: tmp_path)
     assert list(pixel_errors._Views({}, robot, 6, None).errors(source, 1)) == []
     assert asked == [0, 4, 8, 12]
+
+
+def test_what_joins_components_of_one_robot_is_not_counted_between_robots() -> None:
+    def decision(robot: str, peer: str, weight: float) -> SimpleNamespace:
+        return SimpleNamespace(robot=robot, peer=peer, verdict="", weight=weight, measured=True, inliers=9)
+
+    ids = np.array([[1, 2], [3, 4], [5, 6]])
+    robots = {name: SimpleNamespace(component=tuple(NAMES), rejected_matches={}) for name in NAMES}
+    robots["alpha"].rejected_matches["alpha", "alpha-2"] = ids[:2]
+    session = Session(SimpleNamespace(robots=robots))
+    ends = (("alpha", "alpha-2"), ("alpha", "bravo"), ("bravo", "alpha-2"))
+    session.__dict__ |= {
+        "loop_closures": [decision(*pair, weight) for pair in ends for weight in (1.0, 0.1)],
+        "pairs": {("alpha", "alpha-2"): ids, ("alpha", "bravo"): ids[:1], ("alpha-2", "bravo"): ids[:1]},
+    }
+    assert list(session.loop_closure_counts().values()) == [2, 2]
+    assert session.matched_pairs() == 2
+    assert session.rejected_matches_share() == 2 / 15  # three robots, five matches each
+    for unlisted, found in ((("alpha", "alpha-2"), 2), (("alpha", "bravo"), NO_LISTS)):
+        less = Session(SimpleNamespace(robots=robots))
+        less.__dict__["pairs"] = {pair: ids for pair, ids in session.pairs.items() if pair != unlisted}
+        assert less.matched_pairs() == found
+        assert less.rejected_matches_share() == NO_LISTS
 
 
 def test_components_of_a_robot_and_a_peer_are_one_pair() -> None:
