@@ -1,10 +1,14 @@
-"""An earlier run in the place of a new one: whether it is what the new one would be, and what would change."""
+"""An earlier run in the place of a new one: whether it is what the new one would be, what would change, what stays."""
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from duagc.pipeline import manifest
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cache.carrier import intact, words
 from duagc.pipeline.cache.file_digests import FileDigest
@@ -14,7 +18,7 @@ from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.job import READERS, Job
 from duagc.pipeline.preparation import Say, stages_of
 from duagc.pipeline.recording import Recording
-from duagc.pipeline.run_plan import NAMES, RunPlan
+from duagc.pipeline.run_plan import LAST, NAMES, RunPlan
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.timing import label
 
@@ -43,7 +47,7 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
         name = label(key.stage, key.robot)
         if key.stage == stages.VIEW.name and not evaluated:
             continue  # it shows the metrics, which the earlier run did not have
-        known = earlier[name].get("key") if isinstance(earlier.get(name), dict) else None
+        known = _key(earlier, name)
         if name in earlier and known != key.digest:
             changes = "; ".join(job.carrier.changes(key, str(known)))
             raise DuagError(
@@ -60,6 +64,62 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
             log(f"{out / name}: is not what was computed; taken from the store")
             return False
     return True
+
+
+def keep_what_holds(
+    recording: Recording, folder: Path, config: RunConfig, plan: RunPlan, *, out: Path, log: Say
+) -> None:
+    """Bring over to a run what the earlier one in its place has besides, but no result of another configuration.
+
+    Files that somebody else put there are kept. A result that the new run does not have is kept if its stage has the
+    key that it would have now; what is kept of later stages is named in the manifest.
+
+    Args:
+        recording: that the run is of.
+        folder: of the new run, which is done.
+        config: settings of all stages.
+        plan: how it was done; with a store.
+        out: folder of the earlier run.
+        log: gets a line if results are left out.
+    """
+    earlier, made = stages_of(out), stages_of(folder)
+    looked_for = replace(plan, since=None, until=LAST, evaluated=stages.EVALUATION.name in earlier)
+    done, _ = Job(recording, folder, config, looked_for, log=log, place=out, looking=True).look()
+    hold = [carried for carried in done if _key(earlier, carried.label) == carried.entry.key.digest]
+    left_out = _results(out, earlier) - {name for carried in hold for name in carried.entry.files}
+    lost = []
+    for path in sorted(out.rglob("*")):
+        name = path.relative_to(out)
+        if not path.is_file() or (folder / name).exists():
+            continue
+        if name.as_posix() in left_out:
+            lost.append(name.as_posix())
+            continue
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, folder / name)
+    if lost:
+        more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
+        log(f"warning: {out}: left out results of other settings or inputs: {lost[0]}{more}")
+    if plan.until != LAST:  # else it is only not evaluated, and shown without metrics
+        manifest.add_stages(folder, [carried for carried in hold if carried.label not in made])
+
+
+def _key(rows: Mapping[str, Any], name: str) -> str | None:
+    """Digest of the key of a stage in a manifest; None if somebody has written into that."""
+    return rows[name].get("key") if isinstance(rows.get(name), dict) else None
+
+
+def _results(run: Path, rows: Mapping[str, Any]) -> set[str]:
+    """Names of what stages wrote into a run: what its manifest says, and what is called like a result."""
+
+    def found() -> Iterator[Path]:
+        for stage in stages.STAGES:
+            for pattern in stage.writes_files:
+                yield from run.glob(f"robots/*/{pattern}" if stage.per_robot else pattern)
+
+    files = [row["files"] for row in rows.values() if isinstance(row, dict) and "files" in row]
+    named = {name for names in files if isinstance(names, dict) for name in names}
+    return named | {path.relative_to(run).as_posix() for path in found()}
 
 
 def measured_otherwise(out: Path, store: Path) -> str:

@@ -226,16 +226,16 @@ class Job:
             "config.toml": config,
             "times": _digest_of(manifest.times([*self._before, *done])),
         }
-        wanted = {stages.REPORT: of_report, stages.VIEW: notes}
-        wanted = {stage: more for stage, more in wanted.items() if self.plan.has(stage)}
-        if len(wanted) > 1 and not self.carrier.looking:
-            view = partial(self._looking().reader, stages.VIEW, done, notes, workers)
-            _, absent = self._looked_up([stages.VIEW.name], lambda _: view())
-            if absent and workers() > 1:
-                with self._processes().viewing(done, notes) as drawn:
-                    report = self._noted(chain.reader, stages.REPORT, done, of_report, lambda: workers() - 1)
-                    return [report, drawn.result()]
-        return [self._noted(chain.reader, stage, done, more, workers) for stage, more in wanted.items()]
+        both = ((stages.REPORT, of_report), (stages.VIEW, notes))
+        wanted = {stage.name: (stage, done, more, workers) for stage, more in both if self.plan.has(stage)}
+        found, absent = self._looked_up(wanted, lambda name: self._looking().reader(*wanted[name]))
+        if self.carrier.looking:
+            return list(found.values())
+        if len(wanted) > 1 and stages.VIEW.name in absent and workers() > 1:
+            with self._processes().viewing(done, notes) as drawn:
+                report = self._noted(chain.reader, stages.REPORT, done, of_report, lambda: workers() - 1)
+                return [report, drawn.result()]
+        return [self._noted(chain.reader, *of) for of in wanted.values()]
 
     def look(self) -> tuple[list[Carried], list[StageKey]]:
         """What is there, and what would have to be computed as far as that is known."""

@@ -60,7 +60,6 @@ def write_manifest(
         stages: those that have keys, in their order; None: nothing is stored, and none has one.
         more: rows besides these.
     """
-    files = {name: digest.content for carried in done for name, digest in carried.entry.files.items()}
     manifest = {
         "schema": SCHEMA,
         "duagc": __version__,
@@ -68,11 +67,31 @@ def write_manifest(
         "recording": preparation.way(folder, recording),
         "config": digest_file(folder / "config.toml"),
         "inputs": dict(inputs),
-        "outputs": {n: digest for n, digest in files.items() if Path(n).suffix in RESULT_SUFFIXES},
+        "outputs": _outputs(done),
     }
     if stages is not None:
         manifest["stages"] = {carried.label: _row(carried) for carried in stages}
     _write_json(folder / "manifest.json", manifest | dict(more))
+
+
+def add_stages(folder: Path, kept: Sequence[Carried]) -> None:
+    """Name stages in manifest.json and timing.json that a run has from an earlier one.
+
+    Args:
+        folder: of the run.
+        kept: these stages.
+    """
+    of_run, of_times = (json.loads((folder / name).read_bytes()) for name in ("manifest.json", "timing.json"))
+    of_run["outputs"] |= _outputs(kept)
+    of_run["stages"] |= {carried.label: _row(carried) for carried in kept}
+    of_times["stages"] |= {name: row | {"executed": False} for name, row in times(kept).items()}
+    _write_json(folder / "manifest.json", of_run)
+    _write_json(folder / "timing.json", of_times)
+
+
+def _outputs(done: Iterable[Carried]) -> dict[str, str]:
+    files = {name: digest.content for carried in done for name, digest in carried.entry.files.items()}
+    return {name: digest for name, digest in files.items() if Path(name).suffix in RESULT_SUFFIXES}
 
 
 def _row(carried: Carried) -> dict[str, Any]:

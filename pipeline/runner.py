@@ -8,7 +8,6 @@ Everything is written into a temporary folder next to the output, which gets its
 from __future__ import annotations
 
 import multiprocessing
-import shutil
 import threading
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
@@ -18,7 +17,7 @@ from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.packages import check_packages
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.existing_run import is_up_to_date
+from duagc.pipeline.existing_run import is_up_to_date, keep_what_holds
 from duagc.pipeline.job import Job
 from duagc.pipeline.preparation import Say, read_code, say
 from duagc.pipeline.run_plan import LAST, RunPlan
@@ -92,16 +91,7 @@ def _run(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, l
     with new_folder(out, force) as folder:
         Job(recording, folder, config, plan, log=log, place=out).run()
         if completed:
-            _keep_others(out, folder)
-
-
-def _keep_others(out: Path, folder: Path) -> None:
-    """Bring what somebody else put into a run over to its completed version."""
-    for path in sorted(out.rglob("*")):
-        target = folder / path.relative_to(out)
-        if path.is_file() and not target.exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(path, target)
+            keep_what_holds(recording, folder, config, plan, out=out, log=log)
 
 
 def _run_in_child(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> None:

@@ -199,7 +199,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         _part(
             "existing_run",
             "whether an earlier run stands",
-            "base config runs recording cache job run_plan preparation",
+            "base config runs recording cache job run_plan preparation manifest",
         ),
     ),
     (_part("runner", "carries a run", "base config recording job run_plan preparation existing_run"),),

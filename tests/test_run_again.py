@@ -4,9 +4,20 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
+import numpy as np
+
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.runs.digest import digest
 from tests.fixtures.commands import assert_one_line, duagc_here
 from tests.fixtures.small_run import SMALL
+
+ABOUT = {"config.toml", "manifest.json", "timing.json"}
+PREPARED = {
+    f"robots/{robot}/{part}.mcap" for robot in ("alpha", "bravo") for part in ("frontend", "information")
+}
+EXCHANGED = {"exchange.mcap", "consensus.mcap", "robots/alpha/session.npz", "robots/bravo/session.npz"}
 
 
 def again(recording: Path, out: Path, *options: str) -> tuple[int, list[str], str]:
@@ -14,6 +25,19 @@ def again(recording: Path, out: Path, *options: str) -> tuple[int, list[str], st
     settings = [word for line in SMALL for word in ("--set", line)]
     result = duagc_here("run", recording, "--out", out, *settings, *options)
     return result.returncode, result.stderr.splitlines(), result.stdout
+
+
+def names(run_folder: Path) -> set[str]:
+    return {path.relative_to(run_folder).as_posix() for path in run_folder.rglob("*") if path.is_file()}
+
+
+def stages_in(run_folder: Path) -> set[str]:
+    return set(json.loads((run_folder / "manifest.json").read_text())["stages"])
+
+
+def exchange_in(small_runs: Path) -> tuple[str, ...]:
+    """Options that compute the exchange again, with times that no other test gets to see."""
+    return "--from", "exchange", "--until", "exchange", "--store", str(small_runs / "own_store")
 
 
 def executed(run_folder: Path) -> list[str]:
@@ -51,6 +75,77 @@ def test_a_damaged_result_of_a_run_is_taken_from_the_store(
     code, lines, _ = again(small_recording, damaged)
     assert code == 1
     assert "exists already, and exchange differs" in lines[0]
+
+
+def test_results_of_other_settings_do_not_stay_in_a_run(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    """Those that no manifest names neither; files that somebody else put there do."""
+    out = small_runs / "other_fusion"
+    shutil.copytree(small_run, out)
+    mine = {"picture.png", "robots/alpha/before/fused.ply"}
+    (out / "robots" / "alpha" / "before").mkdir()
+    for name in mine:
+        (out / name).write_text("mine")
+    manifest = json.loads((out / "manifest.json").read_text())
+    del manifest["stages"]["evaluation"], manifest["stages"]["report"]  # as if measured by `duagc evaluate`
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    code, lines, printed = again(small_recording, out, "--set=fusion.max_added=3", *exchange_in(small_runs))
+    assert code == 0
+    assert "max_added = 3\n" in (out / "config.toml").read_text()
+    assert names(out) == ABOUT | PREPARED | EXCHANGED | mine
+    assert {name.split(".")[0] for name in stages_in(out)} == {"frontend", "information", "exchange"}
+    assert any("left out results of other settings or inputs: metrics.json and" in line for line in lines)
+    assert "refined.ply" not in printed
+    assert_one_line(duagc_here("evaluate", out), "trajectory.tum: No such file")
+    assert_one_line(duagc_here("report", out), "metrics.json: not found")
+
+
+def test_later_results_of_the_same_settings_stay_in_a_run(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    out = small_runs / "same_fusion"
+    shutil.copytree(small_run, out)
+    (out / "metrics.json").write_text("{}")  # as `duagc evaluate --own-longer` writes it again
+    code, lines, _ = again(small_recording, out, *exchange_in(small_runs))
+    assert code == 0
+    assert executed(out) == ["exchange"]
+    assert names(out) == names(small_run) - {"report/index.html"}  # it shows how long the exchange took
+    assert stages_in(out) == stages_in(small_run) - {"report"}
+    assert any(
+        line.endswith("left out results of other settings or inputs: report/index.html") for line in lines
+    )
+    assert digest(out) == digest(small_run)
+    assert (out / "run.rrd").read_bytes() == (small_run / "run.rrd").read_bytes()
+    assert (out / "metrics.json").read_text() == "{}"
+    code, lines, _ = again(small_recording, out, "--set=fusion.max_added=3")
+    assert code == 1
+    assert "fusion of alpha differs" in lines[0]
+
+
+def test_results_of_another_team_do_not_stay_in_a_run(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    team, out = small_runs / "team", small_runs / "run_of_team"
+    shutil.copytree(small_recording, team)
+    shutil.copytree(small_run, out)
+    third = small_runs / "third"
+    png = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8))[1]
+    with (
+        RecordingWriter(third) as recording,
+        recording.robot("charlie", PinholeCamera(64, 48, 60, 60, 31.5, 23.5), 0.001) as robot,
+    ):
+        for k in range(3):
+            robot.add_frame(k * 33_000_000, png.tobytes(), "png", np.full((48, 64), 1500, np.uint16))
+    shutil.copy(third / "charlie.mcap", team)
+    described, more = (json.loads((folder / "recording.json").read_text()) for folder in (team, third))
+    described["robots"]["charlie"] = more["robots"]["charlie"]
+    (team / "recording.json").write_text(json.dumps(described))
+    code, lines, _ = again(team, out, "--until", "information")
+    assert code == 0, lines
+    charlie = {f"robots/charlie/{part}.mcap" for part in ("frontend", "information")}
+    assert names(out) == ABOUT | PREPARED | charlie
+    assert any("left out results of other settings or inputs: consensus.mcap and" in line for line in lines)
 
 
 def test_another_consensus_computes_nothing_upstream_and_going_back_nothing_at_all(
