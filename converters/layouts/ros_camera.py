@@ -92,7 +92,8 @@ class RosCamera:
         fisheye = model in FISHEYE
         # by four zeros a fisheye is still one: the distance from the center is the angle
         if not np.any(D) and not (fisheye and len(D) >= min(FISHEYE_NUMBERS)):
-            return RosCamera(camera, (), False, frame, len(D) > 0, tuple(R.tolist()), rectified)
+            turn = tuple(R.tolist())
+            return RosCamera(camera, (), False, frame, is_straight=len(D) > 0, R=turn, is_rectified=rectified)
         if fisheye:  # of four numbers, but drivers of RealSense send the five of their structure
             D = np.concatenate([D[:4], np.trim_zeros(D[4:], "b")])
         lengths = FISHEYE_NUMBERS if fisheye else POLYNOMIAL_NUMBERS

@@ -63,7 +63,7 @@ class Lens:
         return np.where(beyond, OUTSIDE, u), np.where(beyond, OUTSIDE, v)
 
     def _beyond_the_turn(self, rays: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Rays [n, 3] so far from the axis that the distortion leads back towards it: no pixel shows them."""
+        """Rays [n, 3] so far from the axis that the distortion leads back toward it: no pixel shows them."""
         across, ahead = np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]
         behind = (ahead <= 0) & (not self.fisheye)
         radius = np.arctan2(across, ahead) if self.fisheye else across / np.where(behind, 1.0, ahead)
