@@ -116,11 +116,10 @@ class DepthColorConsistency:
         color_only = state.register_color(frame)
         if not color_only.ok or state.looks_worse_than_usual(color_only):
             return Reason.CONTRADICTION if state.depth_color_inconsistent else candidate
-        T, T_color_only = candidate.result.T_reference_target, color_only.T_reference_target
+        T, T_color_only = state.in_keyframe(candidate), color_only.T_reference_target
         agree = state.last_good.agrees(T, T_color_only, limits, state.depth_color_inconsistent)
         weak = state.weakly_predicted(state.predict(frame.stamp_ns))
-        keyframe = state.keyframes[candidate.keyframe_index]
-        if agree or (weak and _features_prefer(T, T_color_only, keyframe, frame)):
+        if agree or (weak and _features_prefer(T, T_color_only, state.keyframe, frame)):
             return replace(candidate, unlike=True)
         state.depth_color_inconsistent = True
         view, viewpoint = frame.pyramid.levels[-1], state.viewpoint(candidate)

@@ -196,11 +196,18 @@ class SubmapTracker:
                 self._frames[index], self._submap_of[index] = tracked, self._current
 
     def finish(self) -> TrackedLog:
-        """All frames and submaps. A first submap that remained too small is dropped if there are others."""
-        trackers, frames, limits = self._trackers, list(self._frames), self.config.submaps
+        """All frames and submaps. A first submap that remained too small is dropped if there are others.
+
+        So it is if the log ended within a candidate of more frames: a bad first image costs only itself then.
+        """
+        trackers, frames, limits = list(self._trackers), list(self._frames), self.config.submaps
         submap_of = [index + 1 for index in self._submap_of]
         posed = sum(n == 1 and f.status is not Status.LOST for f, n in zip(frames, submap_of, strict=True))
         small = posed < limits.min_frames or len(trackers[0].keyframes) < limits.min_keyframes
+        if small and len(trackers) == 1 and self._candidate and len(self._candidate.frames) > posed:
+            trackers.append(self._candidate.tracker)
+            for k, tracked in self._candidate.frames.items():
+                frames[k], submap_of[k] = tracked, len(trackers)
         dropped = len(trackers) > 1 and small
         if dropped:
             for k in (k for k, number in enumerate(submap_of) if number == 1):

@@ -257,8 +257,9 @@ class Tracker:
             state.compare_gyro(frame.stamp_ns, step[:3, :3])
         if not same_keyframe:
             state.last_good = None
-        gain = float(result.exposure[0])
-        state.gain_step, state.gain = gain / state.gain if followed else math.inf, gain
+        if found.without is Reason.NONE:  # by color alone, it is relative to the last good frame
+            gain = float(result.exposure[0])
+            state.gain_step, state.gain = gain / state.gain if followed else math.inf, gain
         state.keyframe_index, state.T_keyframe_camera = found.keyframe_index, result.T_reference_target
         state.stamp_ns, state.lost = frame.stamp_ns, False
         state.remember_pose()

@@ -132,6 +132,18 @@ class TrackingState:
         """The keyframe that frames are tracked against."""
         return self.keyframes[self.keyframe_index]
 
+    def in_keyframe(self, candidate: PoseCandidate) -> Array:
+        """T_keyframe_camera [4, 4] of a pose that may be by another keyframe, in the current one.
+
+        Args:
+            candidate: the pose.
+        """
+        T = candidate.result.T_reference_target
+        if candidate.keyframe_index == self.keyframe_index:
+            return T
+        other = self.keyframes[candidate.keyframe_index].T_map_keyframe
+        return se3.inverse(self.keyframe.T_map_keyframe) @ other @ T
+
     def elapsed_s(self, stamp_ns: int) -> float:
         """Time since the last frame that was tracked, seconds.
 
@@ -208,10 +220,14 @@ class TrackingState:
     def weakly_predicted(self, predicted: Prediction) -> bool:
         """Whether a camera that is not lost may be farther from the prediction than a registration reaches.
 
+        So may one whose velocity is not known yet, unless sensors measure its whole motion: a log may begin in motion.
+
         Args:
             predicted: of the frame.
         """
-        return predicted.sigma_px > self.config.tracking.prior.max_deviation_px and not self.lost
+        is_guess = len(self.recent) < 2 and predicted.sigma_px > 0
+        is_far = predicted.sigma_px > self.config.tracking.prior.max_deviation_px
+        return (is_guess or is_far) and not self.lost
 
     def deviation_rad(self, deviation_px: float) -> float:
         """The angle, radians, of a distance in the coarsest image that a registration begins with.

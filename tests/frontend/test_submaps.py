@@ -23,7 +23,7 @@ from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.stage import component_path, run_frontend
 from duagc.pipeline.frontend.submap_joining import join_submaps
-from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
+from duagc.pipeline.frontend.submaps import NO_SUBMAP, SubmapTracker, TrackedLog
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
@@ -198,6 +198,19 @@ def test_a_mirrored_room_joins_nothing(walk) -> None:
     log = tracked([*shots, *mirrored])
     assert len(log.submaps) == 2
     assert [component.numbers for component in joined([*shots, *mirrored], log)] == [(1,), (2,)]
+
+
+def test_a_bad_first_image_of_a_short_log_costs_itself(walk) -> None:
+    """The log ends before the rest of it is long enough for a submap."""
+    shots, path = walk
+    dark = replace(shots[0], color=np.rint(0.05 * shots[0].color).astype(np.uint8))
+    log = tracked([dark, *shots[1:9]])
+    assert [frame.status is Status.LOST for frame in log.frames] == [True] + [False] * 8
+    assert log.frames[0].reason is Reason.SMALL_SUBMAP
+    assert log.submap_of == [NO_SUBMAP] + [log.submaps[0].number] * 8
+    keyframes = log.submaps[0].keyframes
+    T = [keyframes[f.keyframe_index].T_map_keyframe @ f.T_keyframe_camera for f in log.frames[1:]]
+    assert ate_rmse_m(np.array(T)[:, :3, 3], path[1:9, :3, 3]) < 0.005
 
 
 def test_without_submaps_such_frames_are_lost(walk) -> None:
