@@ -25,8 +25,9 @@ from duagc.converters.layouts.validity import shrunk
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.base import Config
+from duagc.pipeline.geometry import so3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.lens import seen_by_source
+from duagc.pipeline.geometry.lens import Lens, Maps, seen_by_source
 from duagc.pipeline.geometry.masks import Mask
 
 Image = NDArray[np.uint8]
@@ -65,6 +66,23 @@ class RawCamera:
     height: int
     fisheye: bool = False
 
+    def maps(self, R_rectified_camera: Array, rectified: PinholeCamera) -> Maps:
+        """Where in its images the pixels of the rectified camera lie.
+
+        Args:
+            R_rectified_camera: [3, 3], takes its coordinates to those of the rectified camera.
+            rectified: the pinhole camera at the same place.
+        """
+        focal_center = (float(self.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        source = PinholeCamera(self.width, self.height, *focal_center)
+        x, y, z = (float(part) for part in so3.log(R_rectified_camera.T))
+        return Lens(source, self.distortion or (0.0,) * 4, self.fisheye, (x, y, z)).maps(rectified)
+
+
+def _of_projection(P: Array, size: tuple[int, int]) -> PinholeCamera:
+    """The rectified camera of a projection [3, 4], images of width and height `size`."""
+    return PinholeCamera(*size, *(float(P[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))))
+
 
 class StereoRig:
     """A calibrated pair. camera: of the rectified left images, to which the depth belongs. baseline_m.
@@ -77,7 +95,7 @@ class StereoRig:
         camera: PinholeCamera,
         baseline_m: float,
         options: StereoOptions | None = None,
-        maps: tuple[tuple[Depth, Depth], tuple[Depth, Depth]] | None = None,
+        maps: tuple[Maps, Maps] | None = None,
         *,
         R_rectified_left: Array | None = None,
     ) -> None:
@@ -118,7 +136,8 @@ class StereoRig:
             raise DuagError(
                 f"{where}: right images are {right.width}x{right.height}, expected {size[0]}x{size[1]}"
             )
-        R, t = T_right_left[:3, :3], T_right_left[:3, 3]
+        # OpenCV's fisheye functions take whole arrays alone, no parts of others
+        R, t = T_right_left[:3, :3].copy(), T_right_left[:3, 3].copy()
         if -t[0] <= abs(t[1]) + abs(t[2]):
             raise DuagError(
                 f"{where}: the right camera sees the left one at {np.round(t, 3).tolist()} m, expected it to the left "
@@ -135,15 +154,10 @@ class StereoRig:
             raise DuagError(
                 f"{where}: rectified focal length is {P_left[0, 0]:g} px, expected about {left.K[0, 0]:g}"
             )
-        maps = [
-            model.initUndistortRectifyMap(c.K, d, R_rect, P[:3, :3], size, cv2.CV_32FC1)
-            for c, d, R_rect, P in ((left, D[0], R_left, P_left), (right, D[1], R_right, P_right))
-        ]
         focal, u0, v0 = float(P_left[0, 0]), float(P_left[0, 2]), float(P_left[1, 2])
         camera = PinholeCamera(*size, focal, focal, u0, v0)
-        return StereoRig(
-            camera, -P_right[0, 3] / P_right[0, 0], options, (maps[0], maps[1]), R_rectified_left=R_left
-        )
+        maps = left.maps(R_left, camera), right.maps(R_right, camera)
+        return StereoRig(camera, -P_right[0, 3] / P_right[0, 0], options, maps, R_rectified_left=R_left)
 
     @staticmethod
     def rectified(
@@ -177,24 +191,11 @@ class StereoRig:
         options: StereoOptions | None = None,
     ) -> StereoRig:
         """A pair with the rectification of a CameraInfo: R [3, 3] and P [3, 4] of left and right."""
-        import cv2
-
-        a, b = (
-            PinholeCamera(
-                left.width, left.height, *(float(p[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-            )
-            for p in P
-        )
+        a, b = (_of_projection(p, (left.width, left.height)) for p in P)
         rig = StereoRig.rectified(a, b, -float(P[1][0, 3]) / float(P[1][0, 0]), where, options=options)
-        model: Any = cv2.fisheye if left.fisheye else cv2
-        size, turns = (left.width, left.height), [np.asarray(r, dtype=np.float64).reshape(3, 3) for r in R]
-        maps = [
-            model.initUndistortRectifyMap(
-                c.K, np.array(c.distortion or (0.0,) * 4), turn, p[:3, :3], size, cv2.CV_32FC1
-            )
-            for c, turn, p in zip((left, right), turns, P, strict=True)
-        ]
-        return StereoRig(a, rig.baseline_m, options, (maps[0], maps[1]), R_rectified_left=turns[0])
+        turns = [np.asarray(r, dtype=np.float64).reshape(3, 3) for r in R]
+        maps = left.maps(turns[0], a), right.maps(turns[1], b)
+        return StereoRig(a, rig.baseline_m, options, maps, R_rectified_left=turns[0])
 
     @cached_property
     def valid(self) -> Mask | None:

@@ -131,3 +131,60 @@ def test_impossible_rigs_are_one_line() -> None:
     small = RawCamera(RIGHT.matrix(), D_RIGHT, 300, 256)
     with pytest.raises(DuagError, match="right images are 300x256, expected 306x256"):
         StereoRig.of(left, small, T_RIGHT_LEFT, "here")
+
+
+FISHEYE = (0.01, -0.02, 0.003, 0.001)
+RADIAL, TURNS_BACK = (-0.1, 0.02, 0.0004, -0.0006), (-0.25, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("fisheye", "distortion"), [(True, FISHEYE), (True, ()), (False, RADIAL)])
+def test_a_point_lies_in_one_row_of_both_rectified_images(
+    fisheye: bool, distortion: tuple[float, ...]
+) -> None:
+    camera = PinholeCamera(376, 240, 200.0, 202.0, 185.0, 118.0)
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    coefficients = np.array(distortion or (0.0,) * 4)
+    raw_camera = RawCamera(camera.matrix(), distortion, camera.width, camera.height, fisheye)
+    stereo = StereoRig.of(raw_camera, raw_camera, T_RIGHT_LEFT, "here", options=OPTIONS)
+    assert stereo._maps is not None
+    points = np.random.default_rng(1).uniform([-1, -0.6, 3], [1, 0.6, 5], (200, 3))
+    rows = points @ stereo.R_rectified_left.T
+    u, v = (
+        stereo.camera.fx * rows[:, 0] / rows[:, 2] + stereo.camera.cx,
+        stereo.camera.fy * rows[:, 1] / rows[:, 2] + stereo.camera.cy,
+    )
+    disparity = stereo.camera.fx * stereo.baseline_m / rows[:, 2]
+    seen = (u - disparity > 1) & (u < camera.width - 2) & (v > 1) & (v < camera.height - 2)
+    assert np.count_nonzero(seen) > 100
+    in_right = points @ T_RIGHT_LEFT[:3, :3].T + T_RIGHT_LEFT[:3, 3]
+    for maps, column, of_camera in zip(stereo._maps, (u, u - disparity), (points, in_right), strict=True):
+        drawn = [
+            cv2.remap(part, column[seen].astype(np.float32), v[seen].astype(np.float32), cv2.INTER_LINEAR)
+            for part in maps
+        ]
+        truth, _ = project(of_camera[seen][:, None], np.zeros(3), np.zeros(3), camera.matrix(), coefficients)
+        error_px = np.stack([d.ravel() for d in drawn], -1) - truth[:, 0]
+        assert np.abs(error_px).max() < 0.1  # maps are read between pixels
+
+
+def test_pixels_beyond_the_turn_of_a_distortion_are_none_of_the_scene() -> None:
+    """There the polynomial leads back into the image, which would be seen twice."""
+    camera = PinholeCamera(376, 240, 130.0, 130.0, 188.0, 120.0)
+    raw_camera = RawCamera(camera.matrix(), TURNS_BACK, camera.width, camera.height)
+    stereo = StereoRig.of(raw_camera, raw_camera, T_RIGHT_LEFT, "here", options=OPTIONS)
+    assert stereo.valid is not None
+    x, y = np.meshgrid(*(np.arange(n) for n in (camera.width, camera.height)))
+    rays = np.stack(
+        [
+            (x - stereo.camera.cx) / stereo.camera.fx,
+            (y - stereo.camera.cy) / stereo.camera.fy,
+            np.ones(x.shape),
+        ],
+        axis=-1,
+    )
+    rays = rays @ stereo.R_rectified_left  # to the left camera
+    radius = np.hypot(rays[..., 0], rays[..., 1]) / rays[..., 2]
+    turn = (3 * 0.25) ** -0.5  # of r (1 - 0.25 r^2)
+    assert np.mean(radius > turn) > 0.01
+    assert not stereo.valid[radius > 1.005 * turn].any()
+    assert stereo.valid[radius < 0.9 * turn].mean() > 0.8
