@@ -9,6 +9,7 @@ from typing import Any, SupportsIndex
 
 from duagc.pipeline import steps
 from duagc.pipeline.base.component_names import robot_of
+from duagc.pipeline.base.unmapped import NothingToMapError, Unmapped
 from duagc.pipeline.cache.carrier import Carried, Carrier
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.recording import RECORDING_FILE, Recording, read_log
@@ -18,13 +19,60 @@ from duagc.pipeline.runs.timing import Timing, label
 from duagc.pipeline.watch import UNWATCHED, Watch
 from duagc.schemas import topics
 
+UNMAPPED = "unmapped"
+"""Names, in the result of a front end, what is known of a log without a map."""
+
 
 @dataclass(frozen=True)
 class Prepared:
-    """A robot, or a component of it, with its own results."""
+    """A robot, or a component of it, with its own results; a robot of whose log no map could be begun has none."""
 
     frontend: Carried
     information: Carried | None
+
+    @property
+    def unmapped(self) -> Unmapped | None:
+        """Why the robot has no map; None: it has one."""
+        row = self.frontend.entry.result.get(UNMAPPED)
+        return None if row is None else Unmapped.of(row, self.frontend.label)
+
+
+def with_map(
+    prepared: Mapping[str, Prepared], recording: Recording
+) -> tuple[dict[str, Prepared], dict[str, Any]]:
+    """The robots that have a map, and what is known of the others, as the manifest has it.
+
+    Args:
+        prepared: every robot, by name.
+        recording: of them.
+
+    Raises:
+        NothingToMapError: none has a map.
+    """
+    unmapped = {name: why for name, robot in prepared.items() if (why := robot.unmapped) is not None}
+    mapped = {name: robot for name, robot in prepared.items() if name not in unmapped}
+    if unmapped and not mapped:
+        raise NothingToMapError(recording.log(min(unmapped)), unmapped[min(unmapped)])
+    return mapped, {name: why.plain() for name, why in unmapped.items()}
+
+
+def warnings_of(prepared: Mapping[str, Prepared], recording: Recording) -> list[str]:
+    """What users should know of the front ends, a line each.
+
+    Args:
+        prepared: every robot, by name.
+        recording: of them.
+    """
+    found = [
+        f"{recording.log(name)}: {why.found}; the run goes on without {name}"
+        for name, robot in sorted(prepared.items())
+        if (why := robot.unmapped) is not None and len(prepared) > 1
+    ]
+    found += [
+        f"{name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
+        for name in sorted(set(prepared) - set(recording.robots))
+    ]
+    return found
 
 
 class Chain:
@@ -62,6 +110,8 @@ class Chain:
     def robot(self, robot: str, *, threads: SupportsIndex, alone: bool = False) -> dict[str, Prepared]:
         """Front end and Fisher information of one robot, from its own log alone; by name of the component.
 
+        A robot of whose log no map could be begun has no files, and no information.
+
         Args:
             robot: its name.
             threads: of the kernels; changes no bit of the result.
@@ -72,14 +122,18 @@ class Chain:
         digest = self._digests.of(log).content if carrier.store is not None else ""
         inputs = {"log": digest}
 
-        def track_and_map(timing: Timing) -> dict[str, int]:
+        def track_and_map(timing: Timing) -> dict[str, Any]:
             size = steps.check_log(log, robot)
             folder.mkdir(parents=True, exist_ok=True)
             settings = carrier.settings_of(stages.FRONTEND)
             report = self._watch.frontend(robot, self._recording.robots.index(robot))
             checkpoints = carrier.checkpoints(carrier.key(stages.FRONTEND, robot, inputs), report)
             with timing.stage(stages.FRONTEND, folder, robot):
-                parts = steps.frontend(log, folder, settings, threads=threads, checkpoints=checkpoints)
+                try:
+                    parts = steps.frontend(log, folder, settings, threads=threads, checkpoints=checkpoints)
+                except NothingToMapError as error:
+                    folder.rmdir()
+                    return size | {"keyframes": 0, "exact": 0, UNMAPPED: error.unmapped.plain()}
             timing.went_on(label("frontend", robot), *checkpoints.before_s)
             timing.stages[label("frontend", robot)]["parts"] = parts
             made = [sum(1 for _ in read_log(path, [topics.KEYFRAME])) for path in folder.glob("*.mcap")]
@@ -87,13 +141,15 @@ class Chain:
             return size | {"keyframes": sum(made), "exact": int(kind == "ray_plane")}
 
         def written() -> Iterator[Path]:
+            if not folder.is_dir():
+                return
             for of_component in steps.move_components(robot, folder).values():
                 yield of_component / "frontend.mcap"
 
         front = carrier.carry(stages.FRONTEND, robot, inputs, track_and_map, files=written)
         names = [Path(name).parts[1] for name in front.entry.files]
-        if alone:
-            return {name: Prepared(front, None) for name in names}
+        if alone or not names:
+            return {name: Prepared(front, None) for name in names or [robot]}
         return {name: Prepared(front, self._information(name, front, digest, threads)) for name in names}
 
     def _information(self, name: str, front: Carried, log_digest: str, threads: SupportsIndex) -> Carried:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
@@ -14,13 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from duagc.pipeline import manifest, preparation, steps
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.component_names import robot_of
+from duagc.pipeline.base.files import digest_of_values
 from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Step
 from duagc.pipeline.cache.carrier import Carried, NotStoredError
 from duagc.pipeline.cache.code_identity import CodeVersion
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
-from duagc.pipeline.chain import Chain, Prepared
+from duagc.pipeline.chain import UNMAPPED, Chain, Prepared, warnings_of, with_map
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.preparation import Say, with_expected, workers_that_fit
@@ -85,7 +84,7 @@ class Job:
         self._versions = {} if self.store is None else preparation.versions(self.store, versions)
         self.digests = FileDigests(None) if self.store is None else self.store.files
         self.missing: list[StageKey] = []
-        self._calibration: dict[str, Any] = {}
+        self._notes: dict[str, Any] = {}  # further rows of the manifest
         self._before: list[Carried] = []
         self._inputs: dict[Path, str] = {}
         self._known_sizes: dict[str, dict[str, int]] = {}
@@ -150,7 +149,7 @@ class Job:
         for line in lines if not self.carrier.looking else ():
             self.log(line)
         of = preparation.way(self.folder, self.recording.path)
-        self._calibration = {"calibration": {"of": of, "cameras": cameras}}
+        self._notes["calibration"] = {"of": of, "cameras": cameras}
         self._before = [carried]
         if carried.entry.files:
             place = self.folder / stages.CALIBRATED
@@ -166,12 +165,15 @@ class Job:
             DuagError: as the stages.
         """
         plan, chain = self.plan, Chain(self.recording, self.carrier, self.digests, self._watch)
-        prepared = self._prepared(chain)
-        own = [c for robot in prepared.values() for c in (robot.frontend, robot.information) if c is not None]
+        every = self._prepared(chain)
+        own = [c for robot in every.values() for c in (robot.frontend, robot.information) if c is not None]
         done = list({c.label: c for c in own}.values())
+        prepared, unmapped = with_map(every, self.recording)
+        self._notes |= {UNMAPPED: unmapped} if unmapped else {}
         workers = cache(lambda: self._fitting(self._sizes(self.recording.robots), READER_SHARE))
-        cameras = self._calibration.get("calibration", {}).get("cameras")
-        notes = {"calibration": _digest_of(cameras)} if cameras else {}
+        cameras = self._notes.get("calibration", {}).get("cameras")
+        notes = {"calibration": digest_of_values(cameras)} if cameras else {}
+        notes |= {UNMAPPED: digest_of_values(unmapped)} if unmapped else {}
         computed = self._computes_exchange(prepared)
         with self._matching(prepared, workers, computed) as matched:
             with self._starting_fusion(prepared, computed) as ready:
@@ -221,10 +223,10 @@ class Job:
         self, chain: Chain, done: list[Carried], notes: dict[str, str], workers: Callable[[], int]
     ) -> list[Carried]:
         """Report and view; next to each other if there are several workers."""
-        config = _digest_of(dump_config(self.config))
+        config = digest_of_values(dump_config(self.config))
         of_report = notes | {
             "config.toml": config,
-            "times": _digest_of(manifest.times([*self._before, *done])),
+            "times": digest_of_values(manifest.times([*self._before, *done])),
         }
         both = ((stages.REPORT, of_report), (stages.VIEW, notes))
         wanted = {stage.name: (stage, done, more, workers) for stage, more in both if self.plan.has(stage)}
@@ -336,10 +338,8 @@ class Job:
         else:
             self.log(f"front end and information: {len(found)} robots from the store")
             self._time_left = self._expected({}, found, self.plan.workers)
-        for name in sorted(set(found) - set(self.recording.robots)):
-            self.log(
-                f"warning: {name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
-            )
+        for line in warnings_of(found, self.recording):
+            self.log(f"warning: {line}")
         return dict(sorted(found.items()))
 
     def _expected(
@@ -392,9 +392,5 @@ class Job:
             {robot: self._digest(self.recording.log(robot)) for robot in self.recording.robots},
             done,
             stages=None if self.store is None else [*self._before, *done],
-            more=self._calibration,
+            more=self._notes,
         )
-
-
-def _digest_of(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

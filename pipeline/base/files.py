@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -67,6 +69,15 @@ def parse_toml(text: str, path: Path, expected: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
         raise DuagError(f"{path}: not valid TOML: {error}, expected {expected}") from error
+
+
+def digest_of_values(values: Any) -> str:
+    """64 hex characters of SHA-256 over plain values, as JSON writes them with sorted names.
+
+    Args:
+        values: tables, lists, texts, numbers.
+    """
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 @contextmanager

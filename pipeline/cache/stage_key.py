@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
+
+from duagc.pipeline.base.files import digest_of_values
 
 SHOWN = 3  # names in a line; the others are counted
 
@@ -35,7 +36,7 @@ class StageKey:
     @cached_property
     def digest(self) -> str:
         """64 hex characters."""
-        return hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode()).hexdigest()
+        return digest_of_values(self.plain())
 
     def plain(self) -> dict[str, Any]:
         """As plain values."""

@@ -27,7 +27,7 @@ class LostStretch:
         first: index of the first frame.
         last: index of the last frame.
         duration_s: from the first frame to the one after the last.
-        reason: as in the log.
+        reason: as in the log; of a log without a map, that of most of its frames.
     """
 
     robot: str
@@ -38,7 +38,7 @@ class LostStretch:
 
 
 def of_robots(run: RunFolder) -> dict[str, dict[str, float | Absent]]:
-    """Counts and shares of every robot, its components taken together.
+    """Counts and shares of every robot, its components taken together; of those that have no map too.
 
     Args:
         run: the run.
@@ -57,7 +57,17 @@ def of_robots(run: RunFolder) -> dict[str, dict[str, float | Absent]]:
             "submaps": max(sum(len(part.submaps) for part in parts), 1),
             "components": len({part.component for part in parts}),
         }
-    return out
+    for robot, log in run.unmapped.items():
+        hidden = log.frames_without_pixel
+        out[robot] = {
+            "frames": log.frames,
+            "frames_without_pixel": hidden,
+            "posed": 0,
+            "coverage": 0.0 if hidden < log.frames else Absent("no frame shows anything"),
+            "submaps": 0,
+            "components": 0,
+        }
+    return dict(sorted(out.items()))
 
 
 def of_components(run: RunFolder, paired: Mapping[str, Paired | Absent]) -> dict[str, dict[str, Any]]:
@@ -101,6 +111,8 @@ def lost_stretches(run: RunFolder) -> list[LostStretch]:
                 duration_s = 1e-9 * (end.stamp_ns - frames[first].stamp_ns)
                 out.append(LostStretch(robot, first, after - 1, duration_s, reason))
             first = after
+    for robot, log in run.unmapped.items():
+        out.append(LostStretch(robot, 0, log.frames - 1, log.duration_s, log.reasons[0]))
     return out
 
 

@@ -233,7 +233,7 @@ def _team_section(run: RunFolder, truth: TruePaths) -> dict[str, Any]:
     ]
     missing = [s for s in solo if isinstance(s, Absent)]
     return {
-        "robots": len({robot_of(name) for name in run.robots}),
+        "robots": len({robot_of(name) for name in run.robots}) + len(run.unmapped),
         "robots_in_largest_component": len({robot_of(name) for name in run.largest_component}),
         "ate_rmse_m": truth.team if isinstance(truth.team, Absent) else truth.team.ate_rmse_m,
         "ate_rmse_m_mean_of_robots": missing[0] if missing else mean(solo),

@@ -15,7 +15,7 @@ from typing import Any
 
 from duagc.converters.simulate.team import simulate
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import new_file, read_text
+from duagc.pipeline.base.files import digest_of_values, new_file, read_text
 from duagc.pipeline.batch.batch import run_batch
 from duagc.pipeline.batch.cell import read_state, run_folder
 from duagc.pipeline.batch.engines import Engine
@@ -348,7 +348,7 @@ def _digest_of(functions: Sequence[str], store: Path) -> str:
     reader, modules = CodeReader(store / "code.json"), dict[str, str]()
     for function in functions:
         modules |= reader.version_of(function).modules
-    return hashlib.sha256(json.dumps(modules, sort_keys=True).encode()).hexdigest()
+    return digest_of_values(modules)
 
 
 def _row(experiment: Experiment, cell: BatchCell, folder: Path, numbers: Mapping[str, object]) -> ResultRow:

@@ -7,7 +7,6 @@ A random sample of the Gaussians of every robot's own map, of a finished run. Th
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError, closest
-from duagc.pipeline.base.files import new_file, read_bytes
+from duagc.pipeline.base.files import digest_of_values, new_file, read_bytes
 from duagc.pipeline.cache.code_identity import CodeReader
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.experiments.information_blocks import BlockSums, sum_blocks
@@ -274,7 +273,7 @@ def wilson(met: int, count: int) -> tuple[float, float]:
 def code_digest() -> str:
     """SHA-256 of the code that everything here is computed by."""
     modules = CodeReader().version_of(f"{__name__}:run").modules
-    return hashlib.sha256(json.dumps(modules, sort_keys=True).encode()).hexdigest()
+    return digest_of_values(modules)
 
 
 def write_gaussians(columns: Mapping[str, NDArray[Any]], path: Path) -> None:

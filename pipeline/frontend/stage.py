@@ -7,6 +7,7 @@ The stage is offline in this sense; times in the log are those of the recording 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,16 +21,17 @@ from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.lap_times import LapTimes
+from duagc.pipeline.base.unmapped import NothingToMapError, Unmapped
 from duagc.pipeline.base.worker_reports import KEYFRAMES
 from duagc.pipeline.config.base import Config
-from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.color_blocks import BlocksOfLog
 from duagc.pipeline.frontend.component_paths import ComponentPath, images_of, optimized_paths, trajectories_of
 from duagc.pipeline.frontend.depth_delay import certain_delay_ns
 from duagc.pipeline.frontend.depth_quality import depth_noise_m, largest_depth_offset_s, median_depth_m
 from duagc.pipeline.frontend.exposure import ExposureEstimation
-from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector
+from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector, Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
 from duagc.pipeline.frontend.lost_frames import registered_again
@@ -57,6 +59,7 @@ from duagc.pipeline.recording import MotionPrior, RgbdFrame, RgbdLog, open_rgbd
 from duagc.pipeline.recording.moved_depth import DELAY_KEY
 from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.pipeline.recording.shutter import FOUND_KEY
+from duagc.pipeline.registration.reference import sampled_grid
 from duagc.pipeline.splat.gaussians import Gaussians
 
 
@@ -86,6 +89,7 @@ def run_frontend(
 
     Raises:
         DuagError: the log is broken or empty.
+        NothingToMapError: none of its frames begins a map.
     """
     determinism.configure_opencv()
     clock, save = LapTimes(), checkpoints or Checkpoints()
@@ -103,12 +107,7 @@ def run_frontend(
         tracking = _Tracking(log, config, motion, save, blocks, seed=seed, threads=threads, progress=progress)
         tracked = tracking.run()
         if not tracked.submaps[0].keyframes:
-            reasons = ", ".join(sorted({frame.reason.value for frame in tracked.frames}))
-            size = f"{log.camera.width} x {log.camera.height}"
-            raise DuagError(
-                f"{log_path}: found no frame of {size} pixels to begin a map with ({reasons}), "
-                "expected one with depth in enough of them"
-            )
+            raise NothingToMapError(log_path, _unmapped(log, tracked, config.tracking))
         noise_m, depth_m = depth_noise_m(tracked.frames), median_depth_m(tracked)
         depth = config.mapping.depth_kind(noise_m, depth_m)
         keyframes = sum(len(submap.keyframes) for submap in tracked.submaps)
@@ -158,6 +157,28 @@ def _named(robot: str, paths: Sequence[ComponentPath]) -> list[tuple[str, int]]:
         if at != largest
     ]
     return [(robot, largest), *others]
+
+
+def _unmapped(log: RgbdLog, tracked: TrackedLog, config: TrackingConfig) -> Unmapped:
+    """What is known of a log that no map begins with."""
+    frames, camera = tracked.frames, log.camera
+    counts = Counter(frame.reason.value for frame in frames)
+    reasons = tuple(sorted(counts, key=lambda reason: (-counts[reason], reason)))
+    size, least = f"{camera.width} x {camera.height}", config.registration.min_samples
+    rows, columns = sampled_grid(camera.width, camera.height, config.strides[0])
+    if (places := len(rows) * len(columns)) < least:
+        found = (
+            f"found images of {size} pixels, in which registration has {places} samples, expected larger ones: "
+            f"{least} samples or more, one every {config.strides[0]} pixels"
+        )
+    else:
+        found = (
+            f"found no frame of {size} pixels to begin a map with ({', '.join(reasons)}), "
+            "expected one with depth in enough of them"
+        )
+    hidden = sum(frame.reason is Reason.NO_PIXEL for frame in frames)
+    duration_s = 1e-9 * (frames[-1].stamp_ns - frames[0].stamp_ns)
+    return Unmapped(len(frames), hidden, duration_s, reasons, found)
 
 
 def _state_classes() -> tuple[type, ...]:

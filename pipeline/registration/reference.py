@@ -18,6 +18,17 @@ GRADIENT_SHARE = 2 / 3  # of a sparse reference's samples; the rest is spread ev
 MARGIN = 2  # pixels at the border that are not sampled
 
 
+def sampled_grid(width: int, height: int, stride: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the pixels that a reference samples where normals are known.
+
+    Args:
+        width: of the image, pixels.
+        height: of the image, pixels.
+        stride: pixels between samples.
+    """
+    return np.arange(MARGIN, height - MARGIN, stride), np.arange(MARGIN, width - MARGIN, stride)
+
+
 @dataclass(frozen=True)
 class ReferenceLevel:
     """Samples for one pyramid level.
@@ -58,8 +69,7 @@ class Reference:
         """
         levels = []
         for level, stride in zip(pyramid.levels, strides, strict=True):
-            rows = np.arange(MARGIN, level.camera.height - MARGIN, stride)
-            columns = np.arange(MARGIN, level.camera.width - MARGIN, stride)
+            rows, columns = sampled_grid(level.camera.width, level.camera.height, stride)
             v, u = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
             normals = level.normals_at(rows, columns).reshape(-1, 3)
             known = np.flatnonzero(normals[:, 2])

@@ -16,6 +16,7 @@ from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.base.shelf import SHELF
+from duagc.pipeline.base.unmapped import Unmapped
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.geometry.exposure import ExposureTrack
@@ -40,6 +41,7 @@ TYPES = {
     "outputs": dict,
     "stages": dict,
     "calibration": dict,
+    "unmapped": dict,
 }
 """What the manifest holds."""
 TABLES = ("robots", "team", "rendering", "calibration", "exchange", "consensus", "protocol", "reasons")
@@ -189,11 +191,18 @@ class RunFolder:
         if not names:
             raise DuagError(f"{self.path}: found no folder robots/<robot>, expected a run")
         for name in self._json("manifest.json").get("inputs", {}):
-            if name not in names:
+            if name not in names and name not in self.unmapped:
                 raise DuagError(
                     f"{folder / name}: no such folder, expected the results that manifest.json names"
                 )
         return {name: RobotRun(name, folder / name, self._digests(name)) for name in names}
+
+    @cached_property
+    def unmapped(self) -> dict[str, Unmapped]:
+        """Robots that the run went on without, by name, in order: no map could be begun in their logs."""
+        rows = self._json("manifest.json").get("unmapped", {})
+        where = f"{self.path / 'manifest.json'}: unmapped"
+        return {name: Unmapped.of(row, f"{where}: {name}") for name, row in sorted(rows.items())}
 
     @cached_property
     def largest_component(self) -> tuple[str, ...]:
