@@ -7,11 +7,13 @@ and do not depend on the order of the sum.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project
@@ -90,34 +92,89 @@ def extract_from_gray(
         most: number of features kept.
         mask: bool [h, w], pixels that may be used; None: all.
     """
+    known = depth_m > 0 if mask is None else (depth_m > 0) & mask
+
+    def usable(u: Array, v: Array, size: Array) -> masks.Mask:
+        row, column = nearest_pixel(v, camera.height), nearest_pixel(u, camera.width)
+        has_depth = depth_m[row, column] > 0
+        return has_depth if mask is None else has_depth & (masks.distance_px(mask)[row, column] > size)
+
+    found = strongest_keypoints(brightened(gray, known), most, usable)
+    u, v = found.pixels.T
+    z = depth_m[nearest_pixel(v, camera.height), nearest_pixel(u, camera.width)].astype(np.float64)
+    return Features(found.descriptors, back_project(camera, u, v, z).astype(np.float32))
+
+
+def nearest_pixel(at: Array, size: int) -> NDArray[np.int64]:
+    """Row or column of the pixel nearest to a place in the image, [n].
+
+    Args:
+        at: places [n], pixels.
+        size: height or width of the image.
+    """
+    return np.clip(np.rint(at).astype(np.int64), 0, size - 1)
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Where SIFT finds something in an image, strongest response first.
+
+    Attributes:
+        descriptors: RootSIFT, uint8 [n, 128].
+        pixels: (u, v) [n, 2].
+        responses: [n].
+    """
+
+    descriptors: Descriptors
+    pixels: Array
+    responses: Array
+
+
+NO_KEYPOINTS = Keypoints(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 2)), np.zeros(0))
+
+
+def strongest_keypoints(
+    image: NDArray[np.uint8],
+    most: int,
+    usable: Callable[[Array, Array, Array], NDArray[np.bool_]],
+    place: Callable[[Array], Array] = lambda pixels: pixels,
+) -> Keypoints:
+    """The strongest keypoints of an image that are usable.
+
+    SIFT computes twice as many as are wanted, the strongest of the whole image; where these lie elsewhere (leaves
+    beyond the range of the depth camera, the robot itself), it computes all.
+
+    Args:
+        image: uint8 [h, w].
+        most: number of keypoints kept.
+        usable: whether keypoints are, bool [n], by u, v and size [n] each, pixels.
+        place: where keypoints [n, 2] of the image lie; by default there.
+    """
     import cv2
 
-    keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(brightened(gray), None)
-    if not keypoints:
-        return Features(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 3), np.float32))
-    u, v = np.array([k.pt for k in keypoints], dtype=np.float64).T
-    response = np.array([k.response for k in keypoints])
-    column = np.clip(np.rint(u).astype(np.int64), 0, camera.width - 1)
-    row = np.clip(np.rint(v).astype(np.int64), 0, camera.height - 1)
-    z = depth_m[row, column].astype(np.float64)
-    if mask is not None:
-        z = np.where(masks.distance_px(mask)[row, column] > [k.size for k in keypoints], z, 0)
-    angle = np.array([k.angle for k in keypoints])
-    order = np.lexsort((angle, u, v, -response))
-    order = order[z[order] > 0][:most]
-    z = z[order]
-    points = back_project(camera, u[order], v[order], z)
-    return Features(root_sift(sift[order]), points.astype(np.float32))
+    for limit in (2 * most, 0):
+        keypoints, sift = cv2.SIFT.create(nfeatures=limit).detectAndCompute(image, None)
+        if not keypoints:
+            return NO_KEYPOINTS
+        pixels = place(np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2))
+        u, v = pixels.T
+        response, angle, size = np.array([(k.response, k.angle, k.size) for k in keypoints]).T
+        order = np.lexsort((angle, u, v, -response))
+        order = order[usable(u, v, size)[order]][:most]
+        if len(order) == most or len(keypoints) < limit:
+            break
+    return Keypoints(root_sift(np.asarray(sift[order], np.float32)), pixels[order], response[order])
 
 
-def brightened(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def brightened(gray: NDArray[np.uint8], usable: masks.Mask) -> NDArray[np.uint8]:
     """The image, or two, four, ... times as bright if it is dark: features are found from a fixed contrast on.
 
     Args:
         gray: uint8 [h, w].
+        usable: bool [h, w], where features may lie; how bright a window or a lamp is elsewhere counts nothing.
     """
-    counts = np.cumsum(np.bincount(gray.ravel(), minlength=256))
-    bright = max(int(np.searchsorted(counts, DARK_PERCENT / 100 * gray.size)), 1)
+    counts = np.cumsum(np.bincount(gray[usable], minlength=256))
+    bright = max(int(np.searchsorted(counts, DARK_PERCENT / 100 * counts[-1])), 1)
     factor = 1
     while factor * bright <= DARK:
         factor *= 2

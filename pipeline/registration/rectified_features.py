@@ -20,12 +20,13 @@ from duagc.pipeline.geometry.image_sampling import sampled
 from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.registration.features import (
     DIMENSIONS,
-    Descriptors,
+    NO_KEYPOINTS,
     Features,
+    Keypoints,
     brightened,
     matches_of,
-    root_sift,
     squared_distances,
+    strongest_keypoints,
 )
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
@@ -65,14 +66,13 @@ def extract_rectified(gray: NDArray[np.uint8], pyramid: RgbdPyramid, most: int, 
         most: number of features kept.
         planes: most directions that the camera is turned to.
     """
-    fine, bright = pyramid.levels[0], brightened(gray)
+    fine = pyramid.levels[0]
+    known = fine.inverse_depth > 0 if fine.mask is None else (fine.inverse_depth > 0) & fine.mask
+    bright = brightened(gray, known)
     found = [_features_of(bright, pyramid, facing, most) for facing in _facings(pyramid, planes)]
-    descriptors, pixels, response = (
-        np.concatenate(parts)
-        for parts in zip(
-            *found, (np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 2)), np.zeros(0)), strict=True
-        )
-    )
+    descriptors = np.concatenate([np.zeros((0, DIMENSIONS), np.uint8), *(k.descriptors for k in found)])
+    pixels = np.concatenate([np.zeros((0, 2)), *(k.pixels for k in found)])
+    response = np.concatenate([np.zeros(0), *(k.responses for k in found)])
     order = np.lexsort((pixels[:, 0], pixels[:, 1], -response))[:most]
     u, v = pixels[order].T
     depth_m = 1 / fine.inverse_depth[_nearest(v), _nearest(u)].astype(np.float64)
@@ -105,36 +105,26 @@ def _facings(pyramid: RgbdPyramid, most: int) -> list[_Facing]:
     return out
 
 
-def _features_of(
-    gray: NDArray[np.uint8], pyramid: RgbdPyramid, facing: _Facing, most: int
-) -> tuple[Descriptors, Array, Array]:
-    """Descriptors [n, 128] found where the camera faces a surface, pixels (u, v) [n, 2] of the image, and responses."""
-    import cv2
-
-    fine = pyramid.levels[0]
-    none = np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 2)), np.zeros(0)
-    view = _TurnedView.of(facing, pyramid)
+def _features_of(gray: NDArray[np.uint8], pyramid: RgbdPyramid, facing: _Facing, most: int) -> Keypoints:
+    """What is found where the camera faces a surface, at the pixels of the image."""
+    fine, view = pyramid.levels[0], _TurnedView.of(facing, pyramid)
     if view is None:
-        return none
-    keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(view.image(gray), None)
-    if not keypoints:
-        return none
-    u, v = view.pixels(np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2))
-    inside = (u >= 1) & (v >= 1) & (u <= fine.camera.width - 2) & (v <= fine.camera.height - 2)
-    row, column = (_nearest(np.where(inside, at, 0)) for at in (v, u))
+        return NO_KEYPOINTS
     halvings = fine.camera.height // facing.members.shape[0]
-    coarse = tuple(
-        np.minimum(at // halvings, size - 1)
-        for at, size in zip((row, column), facing.members.shape, strict=True)
+
+    def usable(u: Array, v: Array, size: Array) -> masks.Mask:
+        inside = (u >= 1) & (v >= 1) & (u <= fine.camera.width - 2) & (v <= fine.camera.height - 2)
+        row, column = (_nearest(np.where(inside, at, 0)) for at in (v, u))
+        coarse = tuple(
+            np.minimum(at // halvings, size - 1)
+            for at, size in zip((row, column), facing.members.shape, strict=True)
+        )
+        good = inside & facing.members[coarse] & (fine.inverse_depth[row, column] > 0)
+        return good if fine.mask is None else good & (masks.distance_px(fine.mask)[row, column] > size)
+
+    return strongest_keypoints(
+        view.image(gray), most, usable, lambda pixels: np.stack(view.pixels(pixels), 1)
     )
-    good = inside & facing.members[coarse] & (fine.inverse_depth[row, column] > 0)
-    if fine.mask is not None:
-        good &= masks.distance_px(fine.mask)[row, column] > [k.size for k in keypoints]
-    response = np.array([k.response for k in keypoints])
-    angle = np.array([k.angle for k in keypoints])
-    order = np.lexsort((angle, u, v, -response))
-    order = order[good[order]][:most]
-    return root_sift(sift[order]), np.stack([u[order], v[order]], axis=1), response[order]
 
 
 @dataclass(frozen=True)

@@ -34,12 +34,36 @@ def test_a_dark_image_has_the_features_of_a_bright_one() -> None:
 
 
 def test_only_dark_images_are_brightened() -> None:
-    bright = np.rint(blobs()).astype(np.uint8)
-    assert brightened(bright) is bright
+    bright, usable = np.rint(blobs()).astype(np.uint8), np.ones((120, 160), bool)
+    assert brightened(bright, usable) is bright
     for factor, share in ((2, 0.3), (4, 0.16), (8, 0.08)):
         dark = np.rint(share * blobs()).astype(np.uint8)
-        np.testing.assert_array_equal(brightened(dark), np.minimum(dark.astype(int) * factor, 255))
-    assert not brightened(np.zeros((12, 16), np.uint8)).any()
+        np.testing.assert_array_equal(brightened(dark, usable), np.minimum(dark.astype(int) * factor, 255))
+    assert not brightened(np.zeros((12, 16), np.uint8), np.ones((12, 16), bool)).any()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_strong_texture_that_is_not_usable_costs_no_features(masked: bool) -> None:
+    """Leaves beyond the range of the depth camera, or the robot itself."""
+    top, leaves = np.s_[:40], np.random.default_rng(2).uniform(0, 255, (40, 160))
+    color = np.repeat(np.rint(0.9 * blobs())[..., None], 3, axis=2).astype(np.uint8)
+    with_leaves, depth, mask = color.copy(), DEPTH.copy(), np.ones(DEPTH.shape, bool)
+    with_leaves[top] = np.rint(cv2.GaussianBlur(leaves, (0, 0), 1.0))[..., None]
+    if masked:
+        mask[top] = False
+    else:
+        depth[top] = 0
+    usual, found = (len(extract(image, depth, CAMERA, 20, mask=mask)) for image in (color, with_leaves))
+    assert found == usual == 20
+
+
+def test_a_bright_window_leaves_a_dark_room_its_features() -> None:
+    color = np.repeat(np.rint(0.1 * blobs())[..., None], 3, axis=2).astype(np.uint8)
+    depth = DEPTH.copy()
+    color[:20], depth[:20] = 235, 0
+    mask = depth > 0
+    assert len(extract(color, depth, CAMERA, 100)) > 20
+    assert len(extract(color, DEPTH, CAMERA, 100, mask=mask)) > 20
 
 
 @pytest.mark.parametrize(
