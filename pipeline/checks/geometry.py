@@ -95,18 +95,29 @@ class Move:
 
 def moves(log: RgbdLog, config: MotionChecks) -> list[Move]:
     """Pairs of frames spread over the log, each registered and the depth of one moved into the other."""
-    stamps = np.array([color for color, _ in log.pairing.pairs], dtype=np.int64)
+    frames = _with_depth_of_their_own(log)
+    stamps = np.array([log.pairing.pairs[index][0] for index in frames], dtype=np.int64)
     found = []
     last = len(stamps) - 1
     for first in np.unique(np.linspace(0, last - 1, min(config.pairs, last)).astype(int)).tolist():
         near = int(np.searchsorted(stamps, stamps[first] + round(1e9 * config.pair_s), side="right")) - 1
-        frame = log.frame(first)
+        frame = log.frame(frames[first])
         for second in sorted({max(near, first + 1), first + 1}, reverse=True):
-            move = _move(frame, log.frame(second), log.camera)
+            move = _move(frame, log.frame(frames[second]), log.camera)
             if move.T_first_second is not None:
                 break
         found.append(move)
     return found
+
+
+def _with_depth_of_their_own(log: RgbdLog) -> list[int]:
+    """Indices of frames, of those that share a depth image the nearest to it in time: of one image nothing moves."""
+    nearest: dict[int, tuple[int, int]] = {}
+    for index, (color_ns, depth_ns) in enumerate(log.pairing.pairs):
+        if depth_ns is not None:
+            here = abs(depth_ns - color_ns), index
+            nearest[depth_ns] = min(nearest.get(depth_ns, here), here)
+    return sorted(index for _, index in nearest.values())
 
 
 def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> Move:

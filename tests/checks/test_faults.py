@@ -228,6 +228,20 @@ def test_a_sound_recording_raises_no_alarm(sound: Path, tmp_path: Path) -> None:
     assert [f.check for f in again.findings] == ["digest"]
 
 
+def seldom_depth(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Depth of every fifth image alone: the frames between share it."""
+    depths = [record.log_time_ns for record in records if record.topic == DEPTH]
+    for record, message, publish_ns in nothing(records):
+        if record.topic != DEPTH or record.log_time_ns in depths[::5]:
+            yield record, message, publish_ns
+
+
+def test_frames_that_share_depth_say_nothing_of_its_scale(sound: Path, tmp_path: Path) -> None:
+    report = check.check(planted(sound, tmp_path / "rec", seldom_depth))
+    assert "depth scale" not in {f.check for f in report.findings}, check.format_report(report)
+    assert report.sound
+
+
 @pytest.mark.parametrize(("change", "calibrate"), [(nothing, False), (late_depth, False), (late_depth, True)])
 def test_a_run_says_as_it_begins_that_depth_is_of_another_time(
     sound: Path, tmp_path: Path, change: Change, calibrate: bool, monkeypatch: pytest.MonkeyPatch
