@@ -85,7 +85,7 @@ class JointTraining:
         self._refined = config.pose_rate > 0 and depth != "ray_plane"
         self._pose_steps = PoseSteps([view.information for view in views])
         self._T_map_camera = np.array([view.T_map_camera for view in views])
-        self._losses = np.zeros(len(views))
+        self._losses = np.full(len(views), np.nan)
 
     @property
     def poses(self) -> dict[int, Array]:
@@ -94,8 +94,9 @@ class JointTraining:
 
     @property
     def losses(self) -> dict[int, float]:
-        """The loss of each view by frame index, before its last step."""
-        return {view.frame_index: float(x) for view, x in zip(self._views, self._losses, strict=True)}
+        """The loss of each view that had a step, by frame index, before its last one."""
+        losses = zip(self._views, self._losses, strict=True)
+        return {view.frame_index: float(x) for view, x in losses if not np.isnan(x)}
 
     def run(self, whole: GrowingMap, steps: int, checkpoints: Checkpoints, part: str) -> int:
         """Take the steps.

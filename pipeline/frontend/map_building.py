@@ -298,8 +298,10 @@ class MapBuilder:
         )
         pruned = training.run(self._whole, steps, save, f"{self.name}.final")
         self._poses |= training.poses
-        losses = [training.losses[keyframe.frame_index] for keyframe in self._keyframes]
-        return replace(stats, pruned=stats.pruned + pruned, loss_after=float(np.mean(losses)))
+        known, frames = training.losses, [keyframe.frame_index for keyframe in self._keyframes]
+        losses = [known[frame] for frame in frames if frame in known]  # a budget may leave steps out
+        loss_after = float(np.mean(losses)) if losses else stats.loss_after
+        return replace(stats, pruned=stats.pruned + pruned, loss_after=loss_after)
 
     def _joint_view(
         self, frame_index: int, T_map_tracked: Array, information: Array, *, fixed: bool = False

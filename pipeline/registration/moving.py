@@ -48,6 +48,10 @@ class FreeSpace:
         for _ in range(config.halvings):
             self._small = self._small.halved()
         self._views: list[_View] = []
+        self._poses, self._centers = (
+            np.zeros((0, 16)),
+            np.zeros((0, 3)),
+        )  # of the views: T_map_camera, center_map
         self._known: dict[tuple[int, bytes], bytes | None] = {}
 
     def add(self, depth_m: Image, T_map_camera: Array) -> None:
@@ -59,7 +63,10 @@ class FreeSpace:
         """
         self._known = {}
         if self.config.enabled:
-            self._views.append(SHELF.put(self._view(depth_m, T_map_camera)))
+            view = self._view(depth_m, T_map_camera)
+            self._views.append(SHELF.put(view))
+            self._poses = np.concatenate([self._poses, view.T_map_camera.reshape(1, 16)])
+            self._centers = np.concatenate([self._centers, view.center_map[None]])
 
     def moving(self, depth_m: Image, T_map_camera: Array) -> Mask:
         """Pixels [h, w] of a view that show what was not there in other views of the set; it may be one of them.
@@ -137,11 +144,11 @@ class FreeSpace:
 
     def _nearest(self, view: _View) -> list[_View]:
         """The views that look at the nearest places, itself excepted."""
-        others = [o for o in self._views if not np.array_equal(o.T_map_camera, view.T_map_camera)]
-        if len(others) <= self.config.views:
-            return others
-        distance = np.linalg.norm(np.array([o.center_map for o in others]) - view.center_map, axis=1)
-        return [others[k] for k in np.argsort(distance, kind="stable")[: self.config.views]]
+        others = np.flatnonzero((self._poses != view.T_map_camera.reshape(16)).any(axis=1))
+        if len(others) > self.config.views:
+            distance = np.linalg.norm(self._centers[others] - view.center_map, axis=1)
+            others = others[np.argsort(distance, kind="stable")[: self.config.views]]
+        return [self._views[k] for k in others]
 
     def _regions(self, found: Mask) -> Mask:
         """Connected regions that are large enough, enlarged, at full size."""

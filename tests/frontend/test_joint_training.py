@@ -85,3 +85,8 @@ def test_the_same_bits_whatever_the_threads() -> None:
     assert all(
         np.array_equal(a, b) for a, b in zip(of_first.poses.values(), of_second.poses.values(), strict=True)
     )
+
+
+def test_views_without_a_step_have_no_loss() -> None:
+    assert list(_trained(steps=0)[1].losses) == []
+    assert len(_trained(steps=1)[1].losses) == 1
