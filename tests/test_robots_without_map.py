@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from duagc.converters.simulate.settings import Cover
 from duagc.converters.simulate.team import simulate
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.unmapped import Unmapped
+from duagc.pipeline.base.unmapped import NothingToMapError, Unmapped
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation.coverage import lost_stretches
@@ -93,3 +94,10 @@ def test_images_that_are_too_small_are_named_as_the_cause(tmp_path: Path) -> Non
 def test_a_changed_manifest_is_an_error() -> None:
     with pytest.raises(DuagError, match=r"manifest\.json: found .* expected a table of duration_s"):
         Unmapped.of({"frames": 3}, "manifest.json")
+
+
+def test_the_error_reaches_another_process() -> None:
+    unmapped = Unmapped(3, 1, 0.1, ("no_depth",), "found nothing")
+    error = pickle.loads(pickle.dumps(NothingToMapError(Path("alpha.mcap"), unmapped)))
+    assert str(error) == "alpha.mcap: found nothing"
+    assert error.unmapped == unmapped

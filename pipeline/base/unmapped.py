@@ -59,4 +59,8 @@ class NothingToMapError(DuagError):
             unmapped: what is known of it.
         """
         super().__init__(f"{log}: {unmapped.found}")
-        self.unmapped = unmapped
+        self.log, self.unmapped = log, unmapped
+
+    def __reduce__(self) -> tuple[type[NothingToMapError], tuple[Path, Unmapped]]:
+        """As it was made, for another process."""
+        return type(self), (self.log, self.unmapped)

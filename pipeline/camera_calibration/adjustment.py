@@ -93,9 +93,9 @@ def adjust(parts: Sequence[Views], rig: CameraRig, calibrate: bool) -> Adjusted:
         if calibrate:
             H[range(ends[-1], total), range(ends[-1], total)] += SAME_ERROR / prior**2
             g[ends[-1] :] += SAME_ERROR * (rig.values() - start.values()) / prior**2
-        d = np.sqrt(np.maximum(np.diag(H), 1e-12))  # nothing moves a view that shows nothing
-        scaled = H / d[:, None] / d
-        x = -np.linalg.solve(scaled + 1e-9 * np.eye(total), g / d) / d
+        d = np.sqrt(np.maximum(np.diag(H), 1e-12))
+        scaled = H / d[:, None] / d + 1e-9 * np.eye(total)  # nothing moves a view that shows nothing
+        x = -np.linalg.solve(scaled, g / d) / d
         for part, step, a, b in zip(parts, steps, ends[:-1], ends[1:], strict=True):
             part.points_map = part.points_map + step.landmarks(np.concatenate([x[a:b], x[ends[-1] :]]))
             part.T_map_camera = part.T_map_camera @ se3.exp(x[a:b].reshape(-1, 6))

@@ -7,12 +7,14 @@ the views that of both. Frames that are held out for the evaluation of maps take
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,11 +24,14 @@ from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.camera_calibration.adjustment import PRIOR, Adjusted, Quality, adjust
 from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
 from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
-from duagc.pipeline.camera_calibration.views import Tracked, Views, load_views, track_log
+from duagc.pipeline.camera_calibration.views import MIN_VIEWS, Tracked, Views, load_views, track_log
 from duagc.pipeline.config.calibration import CalibrationConfig
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.recording import Recording
 
+Found = TypeVar("Found")
+Part = tuple[Tracked, int, int]
+"""A log, and its frames from one to before another."""
 MIN_LANDMARKS = 200  # of a half
 UNKNOWN = 0.7  # share of its prior standard deviation from which a number counts as undetermined
 QUALITIES = ("features_px", "depth_of_features", "depth")
@@ -87,7 +92,7 @@ class Calibration:
         for judged in self.judged:
             ratios = judged.ratios()
             gain, loss = 1 - float(np.exp(np.mean(np.log(ratios)))), max(ratios) - 1
-            if gain < config.min_gain or loss > config.max_loss:
+            if not (gain >= config.min_gain and loss <= config.max_loss):  # nor one that is not a number
                 return (
                     f"{judged.views}, calibrated by {judged.calibrated_by}: {100 * abs(gain):.1f} % "
                     f"{'better' if gain >= 0 else 'worse'} in the mean, "
@@ -138,12 +143,12 @@ def calibrate(
     tracked = _track({robot: source.log(robot) for robot in robots or source.robots}, config, workers)
     if len(tracked) == 1:
         n = len(tracked[0].ok)
-        ranges = [[(tracked[0], a, b)] for a, b in pairwise((0, n // 2, n))]
+        ranges: list[list[Part]] = [[(tracked[0], a, b)] for a, b in pairwise((0, n // 2, n))]
         most = views
     else:
         ranges = [[(t, 0, len(t.ok)) for t in tracked[k::2]] for k in (0, 1)]
         most = max(12, 2 * views // len(tracked))
-    loaded = [[(part, load_views(*part, most)) for part in half] for half in ranges]
+    loaded = [_determined(partial(_loaded, part, most) for part in half) for half in ranges]
     # a robot whose images show nothing to follow says nothing of the cameras
     kept = [[(part, seen) for part, seen in half if len(seen.points_map)] for half in loaded]
     halves = [[seen for _, seen in half] for half in kept]
@@ -167,14 +172,39 @@ def calibrate(
 
 
 def _track(logs: dict[str, Path], config: FrontendConfig, workers: int) -> list[Tracked]:
-    if min(workers, len(logs)) < 2:
-        return [track_log(log, robot, config) for robot, log in logs.items()]
-    with worker_pool(min(workers, len(logs))) as pool:
-        jobs = [pool.submit(track_log, log, robot, config) for robot, log in logs.items()]
-        return [job.result() for job in jobs]
+    """The robots that have frames enough; all that were tracked, if none has."""
+    with ExitStack() as stack:
+        if min(workers, len(logs)) < 2:
+            found = _determined(partial(track_log, log, robot, config) for robot, log in logs.items())
+        else:
+            pool = stack.enter_context(worker_pool(min(workers, len(logs))))
+            tasks = [pool.submit(track_log, log, robot, config) for robot, log in logs.items()]
+            found = _determined(task.result for task in tasks)
+    return [t for t in found if np.count_nonzero(t.ok & ~t.held_out) >= MIN_VIEWS] or found
 
 
-def _between(of: tuple[Tracked, int, int], used: Views, most: int) -> Views | None:
+def _loaded(part: Part, most: int) -> tuple[Part, Views]:
+    return part, load_views(*part, most)
+
+
+def _determined(tasks: Iterable[Callable[[], Found]]) -> list[Found]:
+    """What tasks find but those whose robot says too little of its cameras.
+
+    Raises:
+        UndeterminedError: all do.
+    """
+    found, missing = list[Found](), list[UndeterminedError]()
+    for task in tasks:
+        try:
+            found.append(task())
+        except UndeterminedError as error:
+            missing.append(error)
+    if not found:
+        raise missing[0]
+    return found
+
+
+def _between(of: Part, used: Views, most: int) -> Views | None:
     """Views of frames between those of a part; None if there are too few."""
     try:
         found = load_views(*of, most // 2, without=used.frames.tolist())
@@ -193,7 +223,9 @@ def _calibrate(
     sigma = dict(zip(NAMES, np.sqrt(np.diag(both.covariance)).tolist(), strict=True))
     scale = start.camera.width / 640
     unknown = [
-        n for n in NAMES if sigma[n] > UNKNOWN * PRIOR[n] * (scale if n in ("fx", "fy", "cx", "cy") else 1)
+        n
+        for n in NAMES
+        if not sigma[n] <= UNKNOWN * PRIOR[n] * (scale if n in ("fx", "fy", "cx", "cy") else 1)
     ]
     if unknown:
         raise UndeterminedError(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.base.unmapped import NothingToMapError
 from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.stage import run_frontend
@@ -106,12 +107,18 @@ def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
         path: of the log.
         robot: its name.
         config: of the front end.
+
+    Raises:
+        UndeterminedError: no frame begins a map.
     """
     failure = config.tracking.failure.model_copy(update={"color_check_gray_of_usual": math.inf})
     tracking = config.tracking.model_copy(update={"failure": failure})
     config = config.model_copy(update={"mapping_enabled": False, "tracking": tracking})
     with tempfile.TemporaryDirectory(prefix="duagc-calibrate-") as folder:
-        run_frontend(path, Path(folder) / "frontend.mcap", config, progress=True)
+        try:
+            run_frontend(path, Path(folder) / "frontend.mcap", config, progress=True)
+        except NothingToMapError as error:
+            raise UndeterminedError(str(error)) from error
         frames = RobotRun(robot, Path(folder)).frames
     return Tracked(
         path=path,

@@ -211,6 +211,44 @@ def test_a_robot_whose_images_show_nothing_to_follow_is_left_out(monkeypatch: py
     assert all(np.isfinite([*judged.before.__dict__.values()]).all() for judged in found.judged)
 
 
+def test_a_robot_of_few_frames_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = {"alpha": 60, "bravo": 60, "charlie": 5}
+    seen = {robot: make_views(k, landmarks_count=220) for k, robot in enumerate(frames)}
+
+    def tracked(log: Path, robot: str, config: FrontendConfig) -> Tracked:
+        n = frames[robot]
+        return Tracked(log, robot, np.zeros((n, 4, 4)), np.ones(n, bool), np.zeros(n, bool), np.arange(n))
+
+    def loaded(part: Tracked, first: int, last: int, most: int, *, without: object = ()) -> Views:
+        assert last - first >= 8
+        return copy(seen[part.robot])
+
+    source = SimpleNamespace(robots=list(frames), log=Path, description={})
+    monkeypatch.setattr(calibration, "Recording", lambda folder: source)
+    monkeypatch.setattr(calibration, "track_log", tracked)
+    monkeypatch.setattr(calibration, "load_views", loaded)
+    assert calibrate(Path("team"), FrontendConfig(), []).names == ["room 0", "room 1"]
+
+
+def test_a_view_that_sees_nothing_of_the_others_moves_nothing(views: Views) -> None:
+    rig = CameraRig.of(CAMERA)
+    lonely = copy(views)
+    away = lonely.T_map_camera[-1:].copy()
+    away[0, :3, 3] += 50.0
+    for name, row in (
+        ("T_map_camera", away),
+        ("velocity", views.velocity[-1:]),
+        ("inverse_depth", views.inverse_depth[-1:]),
+        ("normals", views.normals[-1:]),
+        ("samples", views.samples[-1:]),
+    ):
+        setattr(lonely, name, np.concatenate([getattr(views, name), row]))
+    alone, usual = adjust([lonely], rig, True), adjust([copy(views)], rig, True)
+    assert alone.covariance is not None
+    assert usual.covariance is not None
+    np.testing.assert_allclose(alone.covariance, usual.covariance, rtol=1e-3, atol=1e-12)
+
+
 def still_recording(folder: Path, contrast: int = 255) -> Path:
     """A camera that does not move, before a wall with a pattern."""
     rng, camera = np.random.default_rng(0), CAMERA.scaled(160, 120)

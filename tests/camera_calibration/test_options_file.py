@@ -50,6 +50,7 @@ def found_by(converter: str, **parameters: object) -> Calibration:
             "8.1 % better in the mean, up to 3.3 % worse, expected at least 2 % and at most 1 %",
         ),
         (Quality(0.9, 0.9, 1.2), "4.0 % worse in the mean, up to 12.5 % worse"),
+        (Quality(math.nan, 0.9, 1.2), "nan % "),
     ],
 )
 def test_a_calibration_is_refused_unless_views_that_it_did_not_use_agree_better(
