@@ -65,11 +65,12 @@ class Lens:
     def _beyond_the_turn(self, rays: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Rays [n, 3] so far from the axis that the distortion leads back toward it: no pixel shows them."""
         across, ahead = np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]
-        behind = (ahead <= 0) & (not self.fisheye)
+        behind = ahead <= 0  # there OpenCV draws a fisheye as if it were in front
         radius = np.arctan2(across, ahead) if self.fisheye else across / np.where(behind, 1.0, ahead)
+        farthest = float(radius[~behind].max(initial=0.0))
         k = np.zeros(8)
         k[: min(8, len(self.distortion))] = self.distortion[:8]
-        r = np.linspace(0.0, float(radius.max()), TURN_STEPS)
+        r = np.linspace(0.0, farthest, TURN_STEPS)
         s = r * r
         if self.fisheye:
             distorted = r * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))

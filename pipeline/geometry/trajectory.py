@@ -1,5 +1,6 @@
 """Trajectories: TUM files, association, alignment, absolute and relative errors."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file, read_text
 from duagc.pipeline.geometry import se3, so3
+
+LEAST_QUATERNION = 1e-3  # length of what still has a direction
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ def read_tum(path: str | Path) -> Trajectory:
     Returns:
         T_reference_body over time, meters.
     Raises:
-        DuagError: the file cannot be read, or a line is not eight finite numbers.
+        DuagError: the file cannot be read, a line is not eight finite numbers, or a quaternion is zero.
     """
     stamps, rows = [], []
     text = read_text(Path(path), "a TUM trajectory")
@@ -72,13 +75,18 @@ def read_tum(path: str | Path) -> Trajectory:
             row = []
         if len(row) != 7 or not np.all(np.isfinite(row)):
             raise DuagError(f"{path}: line {number} is {line.strip()[:60]!r}, expected eight finite numbers")
+        if math.hypot(*row[3:]) < LEAST_QUATERNION:
+            found = " ".join(fields[4:])
+            raise DuagError(f"{path}: line {number} has the quaternion {found}, expected one of length 1")
         stamps.append(stamp)
         rows.append(row)
     if not rows:
         raise DuagError(f"{path}: found no pose, expected lines `timestamp tx ty tz qx qy qz qw`")
     values = np.array(rows)
     poses = se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3])
-    return Trajectory(np.array(stamps, dtype=np.int64), poses)
+    # files of motion capture repeat times, and some go back: of one time the last pose counts, as for the TUM tools
+    times, last = np.unique(np.array(stamps, dtype=np.int64)[::-1], return_index=True)
+    return Trajectory(times, poses[::-1][last])
 
 
 def _nanoseconds(text: str) -> int:

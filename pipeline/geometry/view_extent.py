@@ -83,9 +83,10 @@ class ViewExtent:
         depth = np.maximum(z, np.float32(NEAR_M))
         side = max(1, camera.width // BLOCKS)
         height, width = self.farthest_m.shape
-        spread = camera.fx * reach / depth + side
+        spread_u, spread_v = (focal * reach / depth + side for focal in (camera.fx, camera.fy))
         u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-        inside = (u > -spread) & (u < camera.width + spread) & (v > -spread) & (v < camera.height + spread)
+        inside = (u > -spread_u) & (u < camera.width + spread_u)
+        inside &= (v > -spread_v) & (v < camera.height + spread_v)
         rows, u, v, z, reach = rows[inside], u[inside], v[inside], z[inside], reach[inside]
         column = np.clip(u / side, 0, width - 1).astype(np.int64)
         row = np.clip(v / side, 0, height - 1).astype(np.int64)

@@ -153,13 +153,24 @@ def screen_of(
     return order, Screen(centers, conics, z, slopes, opacities, colors[order]), from_clamp
 
 
+def slope_limit(pixels: int, focal_px: float, center_px: float) -> float:
+    """Slope beyond which J is clamped: 1.3 times the half field, and never inside the image.
+
+    Args:
+        pixels: of a row or column.
+        focal_px: focal length along it.
+        center_px: place of the principal point on it.
+    """
+    return max(FIELD_MARGIN * pixels / 2, center_px + 0.5, pixels - 0.5 - center_px) / focal_px
+
+
 def linearized(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
     """J W [k, 2, 3] of places [k, 3] in the camera, and how far [k], relatively, they are from where J is clamped."""
     import torch
 
     x, y, z = places.unbind(-1)
-    limit_x = FIELD_MARGIN * camera.width / 2 / camera.fx
-    limit_y = FIELD_MARGIN * camera.height / 2 / camera.fy
+    limit_x = slope_limit(camera.width, camera.fx, camera.cx)
+    limit_y = slope_limit(camera.height, camera.fy, camera.cy)
     zero = torch.zeros_like(z)
     J = torch.stack(
         [

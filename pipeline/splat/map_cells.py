@@ -82,7 +82,9 @@ class MapCells:
         camera = sight.camera
         T_camera_map = se3.inverse(T_map_camera)
         depth_m = self.centers_m @ T_camera_map[2, :3] + T_camera_map[2, 3] - self.radii_m
-        blocks = BLOCKS * camera.fx / camera.width * self.radii_m / np.maximum(depth_m, NEAR_M)
+        blocks = (
+            BLOCKS * max(camera.fx, camera.fy) / camera.width * self.radii_m / np.maximum(depth_m, NEAR_M)
+        )
         seen = np.zeros(len(self.centers_m), bool)
         below = 0
         for reach in REACHES:

@@ -1,6 +1,7 @@
 """What becomes of a calibration: whether it is accepted, and the file of options that says it."""
 
 import json
+import math
 import tomllib
 from dataclasses import replace
 from pathlib import Path

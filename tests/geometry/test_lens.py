@@ -91,3 +91,21 @@ def test_what_lies_beyond_the_turn_of_a_distortion_is_not_seen(
     inside = ((pixels >= 0) & (pixels <= [source.width - 1, source.height - 1])).all(axis=-1)
     assert inside.mean() > 0.3
     assert np.array_equal(seen[near], inside)
+
+
+def test_what_lies_behind_a_fisheye_is_not_seen() -> None:
+    """A camera turned by a radian sees more than 90 degrees off the axis of the lens."""
+    source, turned = (
+        PinholeCamera(424, 400, 143.0, 143.0, 211.5, 199.5),
+        PinholeCamera(100, 100, 50, 50, 50, 50),
+    )
+    lens = Lens(source, (0.0,) * 4, True, (0.0, 1.0, 0.0))
+    rays = turned.rays() @ lens.rotation().T
+    across = np.hypot(rays[..., 0], rays[..., 1])
+    angle = np.arctan2(across, rays[..., 2])
+    true = 143.0 * angle[..., None] * rays[..., :2] / across[..., None] + [211.5, 199.5]
+    maps = lens.maps(turned)
+    seen = seen_by_source(maps, source.width, source.height)
+    assert angle.max() > 1.7
+    assert seen.sum() > 5000
+    np.testing.assert_allclose(np.stack(maps, -1)[seen], true[seen], atol=1e-3)

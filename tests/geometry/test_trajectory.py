@@ -43,6 +43,21 @@ def test_bad_tum_lines_are_named(tmp_path: Path, line: str) -> None:
         trajectory.read_tum(path)
 
 
+def test_a_quaternion_of_zero_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "bad.tum"
+    path.write_text("1.0 1 2 3 0 0 0 1\n2.0 1 2 3 0 0 0 0\n")
+    with pytest.raises(DuagError, match="line 2 has the quaternion 0 0 0 0"):
+        trajectory.read_tum(path)
+
+
+def test_poses_are_in_order_of_their_times_and_the_last_of_one_time_counts(tmp_path: Path) -> None:
+    path = tmp_path / "back.tum"
+    path.write_text("".join(f"{t} {x} 0 0 0 0 0 1\n" for t, x in ((3, 1), (1, 2), (2, 3), (1, 4))))
+    found = trajectory.read_tum(path)
+    assert found.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000, 3_000_000_000]
+    assert found.positions[:, 0].tolist() == [4, 3, 1]
+
+
 def test_ate_ignores_the_frame_but_sees_the_noise() -> None:
     true = walk(400)
     T = se3.exp(np.array([3, -2, 1, 0.4, 2.0, -1.0]))

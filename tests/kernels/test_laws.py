@@ -11,6 +11,7 @@ from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, Rasterizer
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import unpack_geometry
 from tests.kernels.scenes import BACKGROUND, make_scene, random_gaussians
 
@@ -55,6 +56,24 @@ def test_the_last_row_and_column_of_an_image_of_any_size(size, threads):
     assert wanted.alpha[-1].min() > 0.05
     assert wanted.alpha[:, -1].min() > 0.05
     np.testing.assert_allclose(found.alpha, wanted.alpha, atol=1e-4)
+
+
+def test_a_splat_inside_the_image_is_as_wide_wherever_the_principal_point_is():
+    """A cut-out of an image, or a rectified one: what lies inside is linearized where it lies."""
+    whole = PinholeCamera(600, 60, 160.0, 160.0, 299.5, 29.5)
+    x, z, sigma = 5.25, 3.0, 0.06
+    rng = np.random.default_rng(0)
+    true = whole.project(rng.normal([x, 0, z], sigma, (200_000, 3)))[:, 0].std()
+    splat = Gaussians([0], [0], [[x, 0, z]], [[1, 0, 0, 0]], np.log([[sigma] * 3]), [[1, 1, 1]], [-2.0])
+    widths = []
+    for left in (0, 280):  # columns that are cut off
+        camera = PinholeCamera(600 - left, 60, 160.0, 160.0, 299.5 - left, 29.5)
+        light = Rasterizer().forward(splat, camera, np.eye(4)).alpha.sum(axis=0).astype(float)
+        column = np.arange(len(light))
+        mean = (light * column).sum() / light.sum()
+        widths.append(np.sqrt((light * (column - mean) ** 2).sum() / light.sum()))
+    np.testing.assert_allclose(widths, true, rtol=0.1)
+    assert abs(widths[0] - widths[1]) < 0.01
 
 
 def test_counts_do_not_depend_on_threads():

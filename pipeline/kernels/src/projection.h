@@ -67,7 +67,12 @@ struct CameraPoint16 {
         v = fma(Vec(view.fy), slope_y, Vec(view.cy));
     }
 };
-inline float slope_limit(int pixels, float focal) { return FIELD_MARGIN * 0.5f * pixels / focal; }
+// Where the principal point is far from the middle, as in a cut-out, up to the border that is farther from it.
+inline float slope_limit(int pixels, float focal, float center) {
+    const float before = center + 0.5f, after = pixels - before, border = before > after ? before : after;
+    const float usual = FIELD_MARGIN * 0.5f * pixels;
+    return (usual > border ? usual : border) / focal;
+}
 
 inline Splat16 project16(const View& view, const Vec* mean, const Vec* quat, const Vec* log_scale) {
     Splat16 s;
@@ -76,7 +81,7 @@ inline Splat16 project16(const View& view, const Vec* mean, const Vec* quat, con
     s.x = c.x, s.y = c.y, s.z = c.z, s.inverse_z = c.inverse_z;
     s.slope_x = c.slope_x, s.slope_y = c.slope_y, s.u = c.u, s.v = c.v;
 
-    const Vec limit_x(slope_limit(view.width, view.fx)), limit_y(slope_limit(view.height, view.fy));
+    const Vec limit_x(slope_limit(view.width, view.fx, view.cx)), limit_y(slope_limit(view.height, view.fy, view.cy));
     const Vec clamped_x = min(max(s.slope_x, -limit_x), limit_x);
     const Vec clamped_y = min(max(s.slope_y, -limit_y), limit_y);
     s.inside_x = select_or_zero((s.slope_x >= -limit_x) & (s.slope_x <= limit_x), Vec(1.0f));

@@ -105,8 +105,8 @@ inline Mask may_be_seen(const View& view, const Parameters16& p) {
     const auto bound = [&](float focal, float limit) {
         return fma(largest, Vec(3.34f * focal * __builtin_sqrtf(1.0f + limit * limit)), Vec(3.34f * 0.548f));
     };
-    const Vec extent_x = bound(view.fx, slope_limit(view.width, view.fx));
-    const Vec extent_y = bound(view.fy, slope_limit(view.height, view.fy));
+    const Vec extent_x = bound(view.fx, slope_limit(view.width, view.fx, view.cx));
+    const Vec extent_y = bound(view.fy, slope_limit(view.height, view.fy, view.cy));
     return (c.z >= Vec(NEAR_M)) & on_screen(view, c.u, c.v, extent_x, extent_y);
 }
 
