@@ -22,6 +22,7 @@ _CHUNK = struct.Struct("<QQQII")  # first and last time, size, checksum, length 
 
 
 _COMPRESSIONS = (b"zstd", b"lz4")
+_HEAD_BYTES = _RECORD.size + _CHUNK.size + 16  # of a record, by which a chunk is known
 
 
 LARGEST_CHUNK = 1 << 28  # bytes, unpacked; more is damage
@@ -77,17 +78,21 @@ def records_of(stream: IO[bytes], size: int, salvage: Salvage) -> Iterator[Any]:
     if at == 0:
         salvage.damage.append("the file does not begin as a log")
     while at < size:
-        stream.seek(at)
-        head = stream.read(_RECORD.size)
-        opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
+        opcode, length = _record_head(stream, at, size, salvage)
         end = at + _RECORD.size + length
+        stream.seek(at + _RECORD.size)
         if opcode == Opcode.DATA_END and length == 4:
             return
         limit = LARGEST_CHUNK if opcode == Opcode.CHUNK else LARGEST_RECORD
         if not Opcode.HEADER <= opcode <= Opcode.DATA_END or length > limit:
             at = _after_damage(stream, at, size, salvage)
             continue
+        if end > size and (later := _after_damage(stream, at, size, salvage, known=True)) < size:
+            salvage.damage.append(f"at byte {at}: a record of {length} bytes, more than the file has")
+            at = later
+            continue
         if end > size:
+            stream.seek(at + _RECORD.size)
             salvage.cut = True
             salvage.damage.append(f"cut after {size} bytes")
             if opcode == Opcode.CHUNK:
@@ -107,8 +112,31 @@ def records_of(stream: IO[bytes], size: int, salvage: Salvage) -> Iterator[Any]:
     salvage.damage.append(f"no end of the log after {size} bytes")
 
 
+def _record_head(stream: IO[bytes], at: int, size: int, salvage: Salvage) -> tuple[int, int]:
+    """Kind and length of a record; those of a chunk by what follows, where its head is damaged."""
+    stream.seek(at)
+    head = stream.read(_HEAD_BYTES)
+    opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, 0)
+    by_content = _length_of_chunk(head)
+    if by_content is None or (opcode, length) == (Opcode.CHUNK, by_content):
+        return opcode, length
+    if opcode != Opcode.CHUNK and length == by_content:
+        salvage.damage.append(f"at byte {at}: a chunk that is called a record of kind {opcode}")
+    elif (
+        opcode == Opcode.CHUNK
+        and not _is_record(stream, at + _RECORD.size + length, size)
+        and _is_record(stream, at + _RECORD.size + by_content, size)
+    ):
+        salvage.damage.append(f"at byte {at}: a chunk of {by_content} bytes that is said to have {length}")
+    else:
+        return opcode, length
+    return int(Opcode.CHUNK), by_content
+
+
 def _is_record(stream: IO[bytes], at: int, size: int) -> bool:
     """Whether a record may begin here."""
+    if at >= size:
+        return False
     stream.seek(at)
     head = stream.read(_RECORD.size)
     opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
@@ -160,13 +188,21 @@ def _places(window: bytes, pattern: bytes) -> Iterator[int]:
 
 
 def _looks_like_chunk(data: bytes) -> bool:
-    if len(data) < _RECORD.size + _CHUNK.size + 16:
+    if len(data) < _HEAD_BYTES:
         return False
     opcode, length = _RECORD.unpack_from(data)
+    return bool(opcode == Opcode.CHUNK and length == _length_of_chunk(data))
+
+
+def _length_of_chunk(data: bytes) -> int | None:
+    """Length that a chunk has by what follows its head, whatever that says; None: what follows is no chunk."""
+    if len(data) < _HEAD_BYTES:
+        return None
     first, last, unpacked, _, name = _CHUNK.unpack_from(data, _RECORD.size)
+    if first > last or unpacked > LARGEST_CHUNK or name > 8:  # longer than the name of any compression
+        return None
     (packed,) = struct.unpack_from("<Q", data, _RECORD.size + _CHUNK.size + name)
-    sound = opcode == Opcode.CHUNK and first <= last and unpacked <= LARGEST_CHUNK
-    return sound and length == _CHUNK.size + name + 8 + packed
+    return int(_CHUNK.size + name + 8 + packed)
 
 
 def _unpack(body: bytes) -> tuple[bytes, int, int]:

@@ -115,6 +115,26 @@ def test_a_damaged_chunk_is_left_out_and_counted(whole: tuple[Path, list[Record]
         assert salvage.lost == len(records) - len(back) > 0
 
 
+@pytest.mark.parametrize("place", [0, 4], ids=["kind", "length"])
+def test_a_chunk_whose_head_is_damaged_costs_itself_at_most(
+    whole: tuple[Path, list[Record]], tmp_path: Path, place: int
+) -> None:
+    path, records = whole
+    data = path.read_bytes()
+    for start, _ in chunks_of(data):
+        for bit in range(8):
+            broken = bytearray(data)
+            broken[start + place] ^= 1 << bit
+            (tmp_path / "broken.mcap").write_bytes(broken)
+            (salvage,) = recovery.recover(tmp_path / "broken.mcap", tmp_path / "x.mcap", force=True)
+            back = [key(r) for r in read_log(tmp_path / "x.mcap")]
+            assert set(back) <= {key(r) for r in records}
+            assert len(records) - len(back) <= 10
+            assert salvage.damage
+            assert not salvage.cut
+            assert salvage.lost == len(records) - len(back)
+
+
 def test_records_are_found_again_after_garbage(whole: tuple[Path, list[Record]], tmp_path: Path) -> None:
     """The length of a record is destroyed, and a hole of zeros is where another was."""
     path, records = whole
