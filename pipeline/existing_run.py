@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -10,17 +11,21 @@ from typing import Any
 
 from duagc.pipeline import manifest
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.cache.carrier import intact, words
-from duagc.pipeline.cache.file_digests import FileDigest
+from duagc.pipeline.cache.carrier import Carried, intact, words
+from duagc.pipeline.cache.file_digests import FileDigest, FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store, StoredResults
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.job import READERS, Job
+from duagc.pipeline.job import Job
 from duagc.pipeline.preparation import Say, stages_of
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import LAST, NAMES, RunPlan
 from duagc.pipeline.runs import stages
+from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.runs.timing import label
+
+REWRITTEN = (stages.EVALUATION.name, stages.REPORT.name)
+"""Stages whose results users write again as they like, by `duagc evaluate` and `duagc report`."""
 
 
 def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> bool:
@@ -55,15 +60,31 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
             )
     if keys or plan.since is not None or any(carried.label not in earlier for carried in done):
         return False
-    for carried in done:
-        if carried.entry.key.stage in READERS:  # `duagc evaluate` and `duagc report` write these again
-            name = next((name for name in carried.entry.files if not (out / name).is_file()), "")
-        else:
-            name = intact(out, carried.entry, job.digests)
+    for name in (_damaged_table(out), *(_damaged_result(out, carried, job.digests) for carried in done)):
         if name:
             log(f"{out / name}: is not what was computed; taken from the store")
             return False
     return True
+
+
+def _damaged_table(out: Path) -> str:
+    """The first table about the run itself that is not as it was written; "" if both are."""
+    run = RunFolder(out)
+    for name in ("config.toml", "timing.json"):
+        try:
+            if not (run.config_text if name == "config.toml" else run.timing):
+                return name
+        except (DuagError, KeyError):
+            return name
+    return ""
+
+
+def _damaged_result(out: Path, carried: Carried, digests: FileDigests) -> str:
+    """The first file of a stage that is not as it was computed; "" if all are."""
+    if carried.entry.key.stage not in REWRITTEN:
+        return intact(out, carried.entry, digests)
+    files = {name: out / name for name in carried.entry.files}
+    return next((name for name, path in files.items() if not (path.is_file() and path.stat().st_size)), "")
 
 
 def keep_what_holds(
@@ -90,13 +111,20 @@ def keep_what_holds(
     lost = []
     for path in sorted(out.rglob("*")):
         name = path.relative_to(out)
-        if not path.is_file() or (folder / name).exists():
-            continue
+        if os.path.lexists(folder / name) or (
+            path.is_dir() and not path.is_symlink() and any(path.iterdir())
+        ):
+            continue  # there already, or it comes with what it holds
         if name.as_posix() in left_out:
             lost.append(name.as_posix())
             continue
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(path, folder / name)
+        if path.is_symlink():
+            (folder / name).symlink_to(path.readlink())
+        elif path.is_dir():
+            (folder / name).mkdir()
+        else:
+            shutil.copy2(path, folder / name)
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
         log(f"warning: {out}: left out results of other settings or inputs: {lost[0]}{more}")

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 Found = TypeVar("Found")
 READER_SHARE = 2.0  # memory of the evaluation of a robot, relative to its preparation
 FUSION_SHARE = 1.5  # the same of its fusion
-READERS = (stages.EVALUATION.name, stages.REPORT.name, stages.VIEW.name)
 TITLES = {
     stages.CALIBRATION.name: "calibration",
     stages.EXCHANGE.name: "exchange and consensus",

@@ -77,6 +77,37 @@ def test_a_damaged_result_of_a_run_is_taken_from_the_store(
     assert "exists already, and exchange differs" in lines[0]
 
 
+def test_a_run_without_what_it_is_read_by_is_mended(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    damaged = small_runs / "run_to_mend"
+    shutil.copytree(small_run, damaged)
+    (damaged / "videos").symlink_to("../videos")
+    (damaged / "empty").mkdir()
+    config, timing = ((damaged / name).read_text() for name in ("config.toml", "timing.json"))
+    for name, text in (
+        ("config.toml", None),
+        ("config.toml", config.replace("seed = 0", "seed = 5")),
+        ("timing.json", None),
+        ("timing.json", timing[:300]),
+        ("timing.json", '{"a": [1]}'),
+        ("run.rrd", ""),
+        ("metrics.json", ""),
+    ):
+        if text is None:
+            (damaged / name).unlink()
+        else:
+            (damaged / name).write_text(text)
+        code, lines, _ = again(small_recording, damaged)
+        assert code == 0, lines
+        assert lines[0].endswith(f"{name}: is not what was computed; taken from the store")
+        assert "up to date" in again(small_recording, damaged)[1][0]
+    assert (damaged / "config.toml").read_text() == config
+    assert (damaged / "run.rrd").read_bytes() == (small_run / "run.rrd").read_bytes()
+    assert (damaged / "videos").readlink() == Path("../videos")
+    assert (damaged / "empty").is_dir()
+
+
 def test_results_of_other_settings_do_not_stay_in_a_run(
     small_runs: Path, small_recording: Path, small_run: Path
 ) -> None:

@@ -11,7 +11,6 @@ when, changes no bit of any result: a state that is missing or damaged is comput
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -235,8 +234,7 @@ class Checkpoints:
             self._say(
                 f"warning: {self._folder}: {error.strerror or error}; the computation goes on without checkpoints"
             )
-            shutil.rmtree(self._folder, ignore_errors=True)
-            self._folder = None
+            self._folder = None  # what was saved before stays: from there the next process goes on
         self._saved_s = time.perf_counter()
         self._last_cost_s = self._saved_s - began
         self.cost_s += self._last_cost_s

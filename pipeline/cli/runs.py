@@ -205,9 +205,10 @@ def _bytes(option: str, text: str) -> int:
 
 def _say_times(run_folder: Path) -> None:
     """What every stage took, and the most memory that its process held."""
+    from duagc.pipeline.runs.folder import RunFolder
     from duagc.pipeline.runs.stages import STAGES
 
-    rows = json.loads((run_folder / "timing.json").read_text())["stages"].values()
+    rows = RunFolder(run_folder).timing.values()
     order = [stage.name for stage in STAGES]
     for row in sorted(rows, key=lambda row: order.index(row["stage"]) if row["stage"] in order else -1):
         name = f"{row['stage']} of {row['robot']}" if row["robot"] else row["stage"]

@@ -30,8 +30,9 @@ def store(golden: Path, run: Path) -> None:
     """
     if golden.suffix != ".json":
         raise DuagError(f"{golden}: is a name without .json, expected that of a golden run")
-    if golden.exists() and not golden.with_suffix(".npz").is_file():
-        raise DuagError(f"{golden}: exists and is no golden run, expected one or a new name")
+    for path in (golden, golden.with_suffix(".npz")):
+        if path.exists() and not _is_golden(golden):
+            raise DuagError(f"{path}: exists and is no golden run, expected one or a new name")
     found = summarize(run)
     if not found.files:
         raise DuagError(f"{run}: has no results of robots, expected a finished run")
@@ -55,6 +56,15 @@ def store(golden: Path, run: Path) -> None:
         with arrays_part.open("wb") as stream:
             np.savez_compressed(stream, **arrays)
         part.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def _is_golden(path: Path) -> bool:
+    """Whether a golden run is there."""
+    try:
+        _read(path)
+    except DuagError:
+        return False
+    return True
 
 
 def _read(golden: Path) -> tuple[RunSummary, dict[str, object]]:

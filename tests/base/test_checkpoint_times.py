@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import math
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +13,25 @@ import pytest
 
 from duagc.pipeline.base import checkpoints
 from duagc.pipeline.base.checkpoints import Checkpoints
+
+
+def test_what_was_saved_before_the_disk_was_full_is_still_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said, sound = list[str](), checkpoints.write_state
+
+    def full(*args: Any) -> str:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    save = Checkpoints(tmp_path / "checkpoints", say=said.append, every_s=0.0, largest_share=math.inf)
+    save.at("part", 1, 3, lambda: "first")
+    monkeypatch.setattr(checkpoints, "write_state", full)
+    save.at("part", 2, 3, lambda: "second")
+    save.at("part", 3, 3, lambda: "third")
+    assert len(said) == 1
+    assert said[0].endswith("the computation goes on without checkpoints")
+    monkeypatch.setattr(checkpoints, "write_state", sound)
+    assert Checkpoints(tmp_path / "checkpoints").resume("part") == (1, "first")
 
 
 @pytest.mark.parametrize(
