@@ -28,6 +28,8 @@ POSED_TOGETHER = 150
 MOVED_S = 0.10
 """Of moving the depth of a frame, for every million pixels; every stage that reads a frame does it."""
 GAUSSIANS_OF_PIXELS = 0.09
+FIRST_OF_PIXELS = 0.35
+"""Gaussians of the first keyframe of a map, as a share of the pixels of an image."""
 """Gaussians of a tile for every pixel of its keyframes, up to its cap."""
 SEEDING_S = 0.75
 """Of what a keyframe seeds and prunes, for every million pixels."""
@@ -209,6 +211,18 @@ def threaded_s(seconds: float, processors: int) -> float:
         processors: of the machine; threads of a core count each.
     """
     return seconds * (SERIAL + (1 - SERIAL) / processors)
+
+
+def gaussians(size: Size, mapping: MappingConfig) -> float:
+    """How many Gaussians the map of a robot has.
+
+    Args:
+        size: `pixels` of an image, and `keyframes`.
+        mapping: that makes it.
+    """
+    first, tiles = FIRST_OF_PIXELS * size["pixels"], _tiles(size, mapping)
+    later = GAUSSIANS_OF_PIXELS * size["pixels"] * (size["keyframes"] / tiles - 1)
+    return tiles * min(first + max(later, 0), mapping.max_gaussians)
 
 
 def _of_pixels(cost: tuple[float, float], size: Size) -> float:

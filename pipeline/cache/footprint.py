@@ -26,7 +26,7 @@ def robot_bytes(size: Mapping[str, int], measured: Iterable[StoredResults] = ())
     ratios = [
         entry.timing["peak_rss_mb"] * 1e6 / _predicted(entry.result)
         for entry in measured
-        if entry.result and "peak_rss_mb" in entry.timing
+        if entry.result and entry.result.get("keyframes", 1) and "peak_rss_mb" in entry.timing
     ]
     return MARGIN * max([1.0, *ratios]) * _predicted(size)
 

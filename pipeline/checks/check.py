@@ -62,7 +62,7 @@ def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = N
             advice = "duagc recover may save it" if log else ""
             report.findings.append(_unreadable(robot, error, advice))
     report.findings += images.check_colors(sights, config.images)
-    speed = measured.MachineSpeed() if store is None else measured.speed_of(store)
+    speed = measured.MachineSpeed() if store is None else measured.speed_of(Path(store))
     report.estimate = estimate.estimate(report.robots, speed.ratios) | {"measured_stages": speed.stages}
     report.findings += estimate.check_disk(path.parent, report.estimate["bytes"])
     report.findings = list(judged(report.findings, config.sure, config.likely))
@@ -232,7 +232,8 @@ def format_report(report: Report) -> str:
     here = f" (as {e['measured_stages']:.0f} stages took here)" if e["measured_stages"] else ""
     if report.robots:
         out.append(
-            f"a run takes {span} on two idle processors{here}, and about {e['bytes'] / 1e6:.0f} MB of disk"
+            f"a run takes {span} on two idle processors{here}, "
+            f"and about {e['bytes'] / 1e6:.0f} MB of disk with its store"
         )
     out += lines(report.findings)
     counts = [f"{len(found)} {s.value}{'s' * (len(found) != 1)}" for s in Severity if (found := report.of(s))]

@@ -11,12 +11,14 @@ from typing import Any
 
 from duagc.pipeline.cache import durations
 from duagc.pipeline.checks.findings import Finding, Severity
+from duagc.pipeline.config.mapping import MappingConfig
 
 RANGE = 1.5  # times and part of the expected time, where the keyframes are known
 KEYFRAMES = ("keyframes_from", "keyframes_to")
 WORKERS = 2  # robots at a time, as `duagc run` has them by default, each with a processor to itself
-BYTES_PER_ROBOT = 50_000_000  # maps at their cap of Gaussians with information; report and Rerun file
-BYTES_PER_FRAME = 25_000
+BYTES_PER_GAUSSIAN = 1450  # of its robot's map: maps, information, what crossed the network, Rerun file
+BYTES_PER_ROBOT = 1_000_000  # report
+COPIES = 2  # in the folder of the run, and in the store
 
 
 def estimate(
@@ -36,8 +38,10 @@ def estimate(
         math.exp(math.hypot(math.log(RANGE), math.log(_seconds(other, ratios) / seconds)))
         for other in (fewest, most)
     )
-    size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
-    return {"seconds_from": seconds / shorter, "seconds_to": seconds * longer, "bytes": float(size)}
+    size = sum(
+        BYTES_PER_ROBOT + BYTES_PER_GAUSSIAN * durations.gaussians(row, MappingConfig()) for row in rows
+    )
+    return {"seconds_from": seconds / shorter, "seconds_to": seconds * longer, "bytes": float(COPIES * size)}
 
 
 def _seconds(rows: Sequence[Mapping[str, Any]], ratios: Mapping[str, float]) -> float:
@@ -65,6 +69,6 @@ def check_disk(folder: Path, needed: float) -> Iterator[Finding]:
             "disk",
             "",
             f"{free / 1e6:.0f} MB are free where the recording is",
-            f"{needed / 1e6:.0f} MB for a run",
+            f"{needed / 1e6:.0f} MB for a run and its store",
             "free some space, or give `duagc run` an --out on another disk",
         )

@@ -40,11 +40,11 @@ def speed_of(store: Path) -> MachineSpeed:
         return MachineSpeed()
     opened = Store(store)
     fronts = [entry for entry in opened.recent(FRONTEND.name, LAST) if _is_default(entry, FRONTEND)]
-    sizes = {entry.key.inputs["log"]: entry.result for entry in fronts if entry.result}
+    fronts = [entry for entry in fronts if _says(entry, "frames", "pixels", "keyframes")]
+    fronts = [entry for entry in fronts if entry.result["keyframes"]]  # else no map could be begun
+    sizes = {entry.key.inputs["log"]: entry.result for entry in fronts}
     measured = {
-        FRONTEND.name: [
-            entry.timing["cpu_s"] / durations.front_end_s(entry.result) for entry in fronts if entry.result
-        ],
+        FRONTEND.name: [entry.timing["cpu_s"] / durations.front_end_s(entry.result) for entry in fronts],
         FUSION.name: list(_fusions(opened, sizes)),
         EVALUATION.name: list(_evaluations(opened, sizes)),
     }
@@ -58,7 +58,9 @@ def _fusions(store: Store, sizes: Mapping[str, Mapping[str, Any]]) -> Iterator[f
     """Of robots that had peers."""
     for entry in store.recent(FUSION.name, LAST):
         size = sizes.get(entry.key.inputs["log"])
-        if size is not None and entry.result["robots"] > 1 and _is_default(entry, FUSION):
+        if size is None or not _says(entry, "robots"):
+            continue
+        if entry.result["robots"] > 1 and _is_default(entry, FUSION):
             yield entry.timing["cpu_s"] / durations.fusion_s(size)
 
 
@@ -68,8 +70,14 @@ def _evaluations(store: Store, sizes: Mapping[str, Mapping[str, Any]]) -> Iterat
         logs = {digest for digest in entry.key.inputs.values() if digest in sizes}
         predicted = sum(durations.evaluation_s(sizes[digest], len(logs)) for digest in logs)
         robots = {name.split("/")[1] for name in entry.key.inputs if name.startswith("robots/")}
-        if len(logs) == len(robots) and predicted and _is_default(entry, EVALUATION):
+        if len(logs) == len(robots) and predicted and _is_default(entry, EVALUATION) and _says(entry):
             yield entry.timing["cpu_s"] / predicted
+
+
+def _says(entry: StoredResults, *names: str) -> bool:
+    """Whether results say these things of themselves, and what they took; those of earlier versions may not."""
+    result = entry.result if isinstance(entry.result, Mapping) else {}
+    return "cpu_s" in entry.timing and all(name in result for name in names)
 
 
 def _is_default(entry: StoredResults, stage: Stage) -> bool:

@@ -1,6 +1,7 @@
 """What a run takes is predicted from what was measured."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from duagc.pipeline.cache.durations import evaluation_s, front_end_parts, front_end_s, fusion_s
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store, StoredResults
+from duagc.pipeline.checks import measured
 from duagc.pipeline.checks.estimate import estimate
 from duagc.pipeline.checks.measured import MachineSpeed, speed_of
 from duagc.pipeline.config.base import load_config
@@ -57,6 +59,50 @@ def test_small_images_take_more_than_their_share_of_pixels() -> None:
     alone = estimate(robots([(100, 640 * 480, 8)]))
     assert alone["seconds_to"] < large["seconds_to"]
     assert estimate({})["bytes"] == 0
+
+
+@pytest.mark.parametrize(
+    ("rows", "megabytes"),  # of the folder of the run, two robots each
+    [
+        ([(333, VGA, 13), (333, VGA, 13)], 173.1),  # RedKitchen
+        ([(150, VGA, 10), (150, VGA, 17)], 178.2),  # fr1_desk
+        ([(100, 320 * 240, 10), (100, 320 * 240, 10)], 173.3),  # the tutorial
+        ([(30, 160 * 120, 2), (30, 160 * 120, 3)], 29.1),
+        ([(16, 160 * 120, 1), (16, 160 * 120, 2)], 13.5),
+    ],
+)
+def test_the_room_on_the_disk_is_that_of_measured_runs(
+    rows: list[tuple[int, int, int]], megabytes: float
+) -> None:
+    """A store holds as much again."""
+    assert 1e-6 * estimate(robots(rows))["bytes"] == pytest.approx(2 * megabytes, rel=0.8)
+    assert 1e-6 * estimate(robots(rows))["bytes"] > 0.9 * 2 * megabytes
+
+
+def test_results_of_earlier_versions_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They say less of themselves, or of what they took; of some logs no map could be begun."""
+    size, time = {"frames": 30, "pixels": VGA, "keyframes": 3}, {"cpu_s": 10.0}
+
+    def entry(result: Any, timing: dict[str, float], log: str) -> StoredResults:
+        return StoredResults(StageKey("x", "alpha", {}, {}, {}, {"log": log}), {}, result, timing)
+
+    of_stages = {
+        "frontend": [
+            entry(size, time, "a"),
+            entry({"frames": 30, "pixels": VGA}, time, "b"),
+            entry(size, {}, "c"),
+            entry(size | {"keyframes": 0}, time, "d"),
+        ],
+        "fusion": [
+            entry({"robots": 2}, time, "a"),
+            entry({"left_out": {}}, time, "a"),
+            entry(None, time, "a"),
+        ],
+        "evaluation": [entry(None, {}, "a")],
+    }
+    monkeypatch.setattr(measured, "_is_default", lambda entry, stage: True)
+    monkeypatch.setattr(Store, "recent", lambda self, stage, most: iter(of_stages[stage]))
+    assert measured.speed_of(tmp_path).stages == 2
 
 
 def test_keyframes_that_are_not_known_widen_the_range() -> None:
