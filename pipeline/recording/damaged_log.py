@@ -58,6 +58,8 @@ class Salvage:
         """One line for people."""
         if self.whole:
             return f"{self.path}: {self.messages} messages, nothing lost"
+        if ".mcap" not in self.path:
+            return f"{self.path}: {'; '.join(self.damage[:5])}"
         lost = f"{self.lost} lost in between"
         end = ", and all after the cut" if self.cut else ""
         return f"{self.path}: {self.messages} messages, {lost}{end}: {'; '.join(self.damage[:5])}"

@@ -189,6 +189,7 @@ class _Copy:
 
 def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
     """Every log of a folder that is or was to become a recording, and a description that agrees with them."""
+    salvaged = list[Salvage]()
     try:
         description = json.loads(read_bytes(source / RECORDING_FILE, "the JSON of a recording"))
         rows = dict(description["robots"])
@@ -196,7 +197,7 @@ def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
     except (DuagError, ValueError, KeyError, TypeError, RecursionError):
         description, rows = {"name": name, "source": {"folder": source.resolve().name}}, {}
         warnings = [f"{RECORDING_FILE} was lost and made again from the logs"]
-    salvaged = []
+        salvaged.append(Salvage(RECORDING_FILE, damage=["made again from the logs"]))
     for path in sorted(source.iterdir()):
         if not path.name.endswith((".mcap", ".mcap.part")) or path.is_dir():
             continue
@@ -235,6 +236,10 @@ def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
         (folder / geometry).write_bytes((source / geometry).read_bytes())
     else:
         description["geometry"] = None
+    kept = {RECORDING_FILE, description["geometry"]}
+    for path in sorted(source.iterdir()):
+        if path.name not in kept and ".mcap" not in path.suffixes and not path.name.startswith("."):
+            salvaged.append(Salvage(path.name, damage=["is not carried over: no log, and nothing names it"]))
     description |= {"format": RECORDING_FORMAT, "schema": RECORDING_SCHEMA, "robots": robots}
     description["warnings"] = warnings
     (folder / RECORDING_FILE).write_text(json.dumps(description, indent=2) + "\n")

@@ -204,6 +204,17 @@ def test_a_recording_is_recovered_as_a_whole(tmp_path: Path) -> None:
         recovery.recover(rec, tmp_path / "saved")
 
 
+def test_a_description_that_is_lost_is_a_loss(tmp_path: Path) -> None:
+    rec = large_recording(tmp_path / "rec")
+    (rec / "recording.json").unlink()
+    (rec / "groundtruth.ply").write_bytes(b"ply")
+    result = CliRunner().invoke(app, ["recover", str(rec), "--out", str(tmp_path / "saved")])
+    assert result.exit_code == 3
+    assert "recording.json: made again from the logs" in result.stdout
+    assert "groundtruth.ply: is not carried over" in result.stdout
+    assert Recording(tmp_path / "saved").robots == ["alpha", "bravo"]
+
+
 def test_a_robot_whose_log_holds_nothing_is_said_to_be_lost(tmp_path: Path) -> None:
     rec = large_recording(tmp_path / "rec")
     (rec / "alpha.mcap").write_bytes(b"garbage")
