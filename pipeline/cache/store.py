@@ -68,6 +68,10 @@ class StoredResults:
         }
 
 
+PARTS = frozenset(("checkpoints", "claims", "code.json", "entries", "files", "objects"))
+"""What a store consists of, as far as it was needed."""
+
+
 def default_store(out: Path) -> Path:
     """Where results are kept: $DUAGC_STORE, else a folder next to the run.
 
@@ -93,6 +97,9 @@ class Store:
         self.folder = Path(folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise DuagError(f"{folder}: is no folder, expected that of a store")
+        names = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
+        if names and not names & PARTS:
+            raise DuagError(f"{folder}: holds {min(names)}, expected a store or an empty folder")
         self.files = FileDigests(self.folder / "files")
         self.code = CodeReader(self.folder / "code.json")
 

@@ -43,6 +43,7 @@ OTHER_COMPONENT = "other_component"
 """Reason of a frame without a pose that has one in another component of its robot."""
 NONE_MET = "no robot met another, or the settings train no final map"
 NOT_ASKED = "not asked for: duagc evaluate --own-longer"
+NOTHING_TO_COMPARE = "a robot that met no other has no final map to compare with"
 REASONS = {
     "held_out": "there is no such view",
     "training": "there is no such view",
@@ -84,8 +85,8 @@ class _Found:
     def summary(self, robots: list[str], kind: str, view_set: str) -> dict[str, Any]:
         if kind == "own_unrefined":
             reason = "the front end wrote no map before its refinement"
-        elif kind == "own_longer" and not self.longer:
-            reason = NOT_ASKED
+        elif kind == "own_longer":
+            reason = NOTHING_TO_COMPARE if self.longer else NOT_ASKED
         else:
             reason = NONE_MET if kind in ("own_longer", "refined", CENTRAL) else REASONS[view_set]
         return views.summary([s for r in robots for s in self.of(r, kind, view_set)], reason)

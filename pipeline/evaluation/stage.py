@@ -144,7 +144,9 @@ def evaluate(
         }
         of_robots = measures()
     hear((OF_TEAM, "team", 0, 1))
-    rendering = rendering_sections({name: m.scores for name, m in of_robots.items()}, longer=bool(longer))
+    rendering = rendering_sections(
+        {name: m.scores for name, m in of_robots.items()}, longer=own_longer is not None
+    )
     tree = {
         "schema": METRICS_SCHEMA,
         "robots": {

@@ -54,6 +54,8 @@ class TeamBench:
 
     def __init__(self, run: RunFolder, recording: Recording, config: ExchangeConfig, seed: int) -> None:
         """config, seed: those of the run."""
+        if len(run.robots) < 2:
+            raise DuagError(f"{run.path}: has one robot, expected two or more")
         self.run, self.config, self.seed = run, config, seed
         self.data = [thinned(load(_input(run, recording, robot))) for robot in run.robots]
         self.truth = {}
@@ -184,13 +186,15 @@ def run(
     worst: dict[str, Any] = {}
     for row in rows:
         ate, of = row["team_ate_rmse_m"], base["team_ate_rmse_m"]
-        entry = worst.setdefault(row["case"], {"sessions": 0, "apart": 0, "difference_m": 0.0, "share": 0.0})
+        entry = worst.setdefault(
+            row["case"], {"sessions": 0, "apart": 0, "difference_m": None, "share": None}
+        )
         entry["sessions"] += 1
         if ate is None or of is None:
             entry["apart"] += 1
             continue
-        entry["difference_m"] = max(entry["difference_m"], abs(ate - of))
-        entry["share"] = max(entry["share"], ate / of - 1)
+        for name, value in (("difference_m", abs(ate - of)), ("share", ate / of - 1)):
+            entry[name] = value if entry[name] is None else max(entry[name], value)
     return {"base": base, "worst": worst, "rows": rows}
 
 
@@ -250,8 +254,11 @@ def format_table(result: dict[str, Any]) -> str:
         rows.append(cells)
     lines = markdown(head, rows)
     for case, entry in result["worst"].items():
-        lines.append(
-            f"{case}: {entry['sessions']} sessions, {entry['apart']} not together; team ATE differs by "
-            f"{entry['difference_m']:.1e} m at most, is larger by {100 * entry['share']:.2f} % at most"
-        )
+        found = "nothing to compare"
+        if entry["difference_m"] is not None:
+            found = (
+                f"team ATE differs by {entry['difference_m']:.1e} m at most, "
+                f"is larger by {100 * entry['share']:.2f} % at most"
+            )
+        lines.append(f"{case}: {entry['sessions']} sessions, {entry['apart']} not together; {found}")
     return "\n".join(lines)

@@ -91,6 +91,7 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
     Raises:
         DuagError: nothing of the kind is there, a line is not understood, or the graph is two-dimensional.
     """
+    path = Path(path)  # a text will do
     edges, files, ignored = _read(path)
     names = sorted({key[0] for key in (*edges.i, *edges.j)})
     if names == [""]:

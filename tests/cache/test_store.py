@@ -212,6 +212,14 @@ def test_a_file_is_no_store(tmp_path: Path) -> None:
         Store(tmp_path / "store")
 
 
+def test_another_folder_is_no_store(tmp_path: Path) -> None:
+    (tmp_path / "recording.json").write_text("{}")
+    with pytest.raises(DuagError, match=r"holds recording\.json, expected a store or an empty folder"):
+        Store(tmp_path)
+    (tmp_path / "empty").mkdir()
+    Store(tmp_path / "empty")
+
+
 def test_a_store_can_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DUAGC_STORE", raising=False)
     assert default_store(tmp_path / "run") == tmp_path / ".duagc-store"

@@ -262,6 +262,8 @@ def test_own_maps_are_trained_longer_only_if_asked(metrics, tmp_path):
     assert asked["rendering"]["own_longer"]["held_out"]["views"] > 0
     assert metrics["rendering"]["own_longer"]["held_out"]["views"] == 0
     assert "--own-longer" in reason_of(metrics["reasons"], "rendering.own_longer.held_out.psnr_db")
+    none = evaluate(fake.run, fake.recording, progress=False, own_longer={})  # no robot met another
+    assert "no final map" in reason_of(none["reasons"], "rendering.own_longer.held_out.psnr_db")
     others = ("own", "own_unrefined", "fused", "refined")
     assert {k: asked["rendering"][k] for k in others} == {k: metrics["rendering"][k] for k in others}
 

@@ -70,6 +70,13 @@ def test_a_changed_message_is_named(run: Path, tmp_path: Path) -> None:
 
 def test_a_changed_setting_is_named(run: Path, tmp_path: Path) -> None:
     golden = tmp_path / "golden.json"
+    for name in ("golden.npz", "golden.json"):  # of somebody else
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(DuagError, match="exists and is no golden run"):
+            store(golden, run)
+        assert (tmp_path / name).read_text() == "mine"
+    for name in ("golden.npz", "golden.json"):
+        (tmp_path / name).unlink()
     store(golden, run)
     assert differences(golden, run) == []
     shutil.copytree(run, tmp_path / "run")
