@@ -127,7 +127,8 @@ class StereoRig:
             where: begins the line of an error.
             options: of the matching; by default those of `StereoOptions`.
         Raises:
-            DuagError: the cameras are not side by side, left to the left, or no part of the images is rectified.
+            DuagError: the cameras are not side by side, left to the left, one alone is a fisheye, or no part of the
+                images is rectified.
         """
         import cv2
 
@@ -136,6 +137,8 @@ class StereoRig:
             raise DuagError(
                 f"{where}: right images are {right.width}x{right.height}, expected {size[0]}x{size[1]}"
             )
+        if left.fisheye != right.fisheye:
+            raise DuagError(f"{where}: one camera of the pair is a fisheye, expected both or none")
         # OpenCV's fisheye functions take whole arrays alone, no parts of others
         R, t = T_right_left[:3, :3].copy(), T_right_left[:3, 3].copy()
         if -t[0] <= abs(t[1]) + abs(t[2]):

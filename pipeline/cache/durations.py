@@ -28,9 +28,9 @@ POSED_TOGETHER = 150
 MOVED_S = 0.10
 """Of moving the depth of a frame, for every million pixels; every stage that reads a frame does it."""
 GAUSSIANS_OF_PIXELS = 0.09
+"""Gaussians of a tile for every pixel of its keyframes, up to its cap."""
 FIRST_OF_PIXELS = 0.35
 """Gaussians of the first keyframe of a map, as a share of the pixels of an image."""
-"""Gaussians of a tile for every pixel of its keyframes, up to its cap."""
 SEEDING_S = 0.75
 """Of what a keyframe seeds and prunes, for every million pixels."""
 MAPPING_S, FINAL_S = (0.10, 0.021), (0.19, 0.027)

@@ -92,12 +92,15 @@ class Store:
             folder: of the store.
 
         Raises:
-            DuagError: something else is there.
+            DuagError: something else is there, or it cannot be read.
         """
         self.folder = Path(folder)
         if self.folder.exists() and not self.folder.is_dir():
             raise DuagError(f"{folder}: is no folder, expected that of a store")
-        names = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
+        try:
+            names = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
+        except OSError as error:
+            raise DuagError(f"{folder}: {error.strerror or error}, expected a store") from error
         if names and not names & PARTS:
             raise DuagError(f"{folder}: holds {min(names)}, expected a store or an empty folder")
         self.files = FileDigests(self.folder / "files")

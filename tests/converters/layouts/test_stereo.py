@@ -167,6 +167,13 @@ def test_a_point_lies_in_one_row_of_both_rectified_images(
         assert np.abs(error_px).max() < 0.1  # maps are read between pixels
 
 
+def test_one_fisheye_alone_is_refused() -> None:
+    pinhole = raw(LEFT, D_LEFT)
+    fisheye = RawCamera(RIGHT.matrix(), FISHEYE, RIGHT.width, RIGHT.height, True)
+    with pytest.raises(DuagError, match="one camera of the pair is a fisheye"):
+        StereoRig.of(pinhole, fisheye, T_RIGHT_LEFT, "here")
+
+
 def test_pixels_beyond_the_turn_of_a_distortion_are_none_of_the_scene() -> None:
     """There the polynomial leads back into the image, which would be seen twice."""
     camera = PinholeCamera(376, 240, 130.0, 130.0, 188.0, 120.0)
