@@ -19,6 +19,7 @@ import numpy as np
 
 from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
 from duagc.converters.simulate.sensors.rig import Rig
+from duagc.converters.simulate.settings import SimulationSettings
 from duagc.converters.simulate.team import simulate
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
@@ -196,6 +197,9 @@ def run(
 
     Returns:
         The rows, in the order of the cells.
+
+    Raises:
+        DuagError: a level is beyond what the simulator can do.
     """
     (out / "cells").mkdir(parents=True, exist_ok=True)
     made_by = hashlib.sha256(f"{code_digest()}\n{settings}".encode()).hexdigest()
@@ -203,6 +207,8 @@ def run(
     wanted = {cell: {"cell": asdict(cell), "plan": plain, "made_by": made_by} for cell in plan.cells()}
     found = {cell: row for cell, want in wanted.items() if (row := _kept(out, cell, want)) is not None}
     waiting = [cell for cell in plan.cells() if cell not in found]
+    for cell in waiting:  # before minutes of work
+        SimulationSettings(**_settings(cell, plan)).check()
 
     def measure_all(cells: Sequence[Cell]) -> Iterator[tuple[Cell, dict[str, Any]]]:
         for cell in cells:
@@ -254,20 +260,14 @@ def simulate_cell(cell: Cell, plan: RobustnessPlan, out: Path, *, workers: int =
         out: folder of the recording; there is none yet.
         workers: processes that render; changes no result.
     """
+    simulate(out, **_settings(cell, plan), workers=workers)
+
+
+def _settings(cell: Cell, plan: RobustnessPlan) -> dict[str, Any]:
+    """What is simulated for a cell."""
     rig, degradations = cell.settings()
-    simulate(
-        out,
-        robots=plan.robots,
-        frames=plan.frames,
-        scene=plan.scene,
-        size=plan.size,
-        noise=plan.noise,
-        seed=plan.seed,
-        rig=rig,
-        degradations=degradations,
-        triangles=True,
-        workers=workers,
-    )
+    walk = {name: getattr(plan, name) for name in ("robots", "frames", "scene", "size", "noise", "seed")}
+    return walk | {"rig": rig, "degradations": degradations, "triangles": True}
 
 
 def measured(run_folder: RunFolder, recording: Recording) -> dict[str, Any]:

@@ -105,6 +105,15 @@ def no_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "Recording", lambda path: None)
 
 
+def test_a_level_that_cannot_be_is_refused_before_a_cell_is_computed(tmp_path: Path) -> None:
+    def never(recording: Path, out: Path) -> None:
+        raise AssertionError("a cell was computed")
+
+    plan = replace(PLAN, dials=("rolling_shutter",), levels=(1.0, 1.5))
+    with pytest.raises(DuagError, match=r"readout is 0\.045"):
+        bench.run(plan, tmp_path, never, "")
+
+
 @pytest.mark.usefixtures("no_images", "no_numbers")
 def test_finished_cells_are_kept_unless_they_are_damaged(tmp_path: Path) -> None:
     calls: list[Path] = []
