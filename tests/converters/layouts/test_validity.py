@@ -55,7 +55,8 @@ def images(count: int, black: np.ndarray, level: int = 120) -> validity.BlackBor
     found = validity.BlackBorder()
     rng = np.random.default_rng(0)
     for _ in range(count):
-        image = rng.integers(level, level + 20, (48, 64, 3), dtype=np.uint8)
+        blocks = rng.integers(level, level + 20, (6, 8, 3), dtype=np.uint8)
+        image = blocks.repeat(8, axis=0).repeat(8, axis=1)
         image[black] = rng.integers(0, 6, (np.count_nonzero(black), 3), dtype=np.uint8)
         found.add(cv2.imencode(".png", image)[1].tobytes())
     return found
@@ -74,6 +75,19 @@ def test_a_black_vignette_is_found_with_a_margin() -> None:
     assert 0 < np.count_nonzero(~shown & ~black) < 0.25 * black.size
 
 
+@pytest.mark.parametrize("gain", [0.0, 0.3])
+def test_what_is_dark_before_a_camera_that_stands_still_is_no_vignette(gain: float) -> None:
+    """Whatever its exposure does."""
+    rng, found = np.random.default_rng(0), validity.BlackBorder()
+    scene = cv2.resize(rng.uniform(60, 180, (6, 8, 3)), (64, 48), interpolation=cv2.INTER_CUBIC)
+    scene[30:, :20] = 2
+    for k in range(30):
+        image = scene * (1 + gain * np.sin(k / 3)) + rng.normal(0, 2, scene.shape)
+        image[30:, :20] = 2
+        found.add(cv2.imencode(".png", np.clip(image, 0, 255).astype(np.uint8))[1].tobytes())
+    assert found.result(None) is None
+
+
 def test_bars_that_leave_little_of_an_image_are_found() -> None:
     bars = np.ones((48, 64), bool)
     bars[14:30] = False
@@ -85,14 +99,15 @@ def test_bars_that_leave_little_of_an_image_are_found() -> None:
 
 def test_a_camera_of_few_images_a_second_is_looked_at_as_often(tmp_path: Path) -> None:
     """At 4 Hz every image shows, at 40 Hz every tenth: 12 images are enough, or too few."""
-    color = np.full((48, 64, 3), 120, np.uint8)
-    color[:10] = 0
-    data = cv2.imencode(".png", color)[1].tobytes()
+    rows = np.random.default_rng(0).integers(100, 200, (12, 64, 3), dtype=np.uint8)
+    colors = np.repeat(rows[:, None], 48, axis=1)
+    colors[:, :10] = 0
+    images = [cv2.imencode(".png", color)[1].tobytes() for color in colors]
     for rate, found in ((4, True), (40, False)):
         camera = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
         recording = RecordingWriter(tmp_path / str(rate))
         with recording, recording.robot("alpha", camera, 0.001) as robot:
-            for k in range(12):
+            for k, data in enumerate(images):
                 robot.add_frame(k * 10**9 // rate, data, "png", np.full((48, 64), 1000, np.uint16))
         assert any("black in all images" in text for text in recording.warnings) == found
 
