@@ -63,11 +63,13 @@ def warnings_of(prepared: Mapping[str, Prepared], recording: Recording) -> list[
         prepared: every robot, by name.
         recording: of them.
     """
-    found = [
-        f"{recording.log(name)}: {why.found}; the run goes on without {name}"
-        for name, robot in sorted(prepared.items())
-        if (why := robot.unmapped) is not None and len(prepared) > 1
-    ]
+    unmapped = {name: why for name, robot in sorted(prepared.items()) if (why := robot.unmapped) is not None}
+    found = []
+    if len(unmapped) < len(prepared):  # else the run ends
+        found += [
+            f"{recording.log(name)}: {why.found}; the run goes on without {name}"
+            for name, why in unmapped.items()
+        ]
     found += [
         f"{name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
         for name in sorted(set(prepared) - set(recording.robots))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -70,11 +70,15 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
 def _damaged_table(out: Path) -> str:
     """The first table about the run itself that is not as it was written; "" if both are."""
     run = RunFolder(out)
-    for name in ("config.toml", "timing.json"):
+    tables: dict[str, Callable[[], object]] = {
+        "config.toml": lambda: run.config_text,
+        "timing.json": lambda: run.timing,
+    }
+    for name, read in tables.items():
         try:
-            if not (run.config_text if name == "config.toml" else run.timing):
+            if not read():
                 return name
-        except (DuagError, KeyError):
+        except DuagError:
             return name
     return ""
 

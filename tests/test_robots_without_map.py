@@ -73,12 +73,14 @@ def test_a_finished_run_of_it_is_up_to_date(finished: tuple[Path, list[str]]) ->
 
 
 def test_no_robot_with_a_map_is_an_error(tmp_path: Path) -> None:
+    said = list[str]()
     recording, config = (
         covered(tmp_path / "recording", "alpha", "bravo"),
         load_config(RunConfig, overrides=SMALL),
     )
     with pytest.raises(DuagError, match=r"alpha\.mcap: found no frame of 160 x 120 pixels .*\(no_pixel\)"):
-        run(recording, tmp_path / "run", config, log=lambda line: None)
+        run(recording, tmp_path / "run", config, log=said.append)
+    assert not [line for line in said if "goes on without" in line]
     assert not (tmp_path / "run").exists()
 
 

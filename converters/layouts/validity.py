@@ -28,10 +28,8 @@ BRIGHT_PERCENT = 75
 LEAST_IMAGES = 8  # that must tell
 LEAST_BLACK = 0.002  # of the pixels, in pieces that touch the border
 GROW_PX = 4  # a vignette does not end from one pixel to the next
-SMALL_PX, MOST_SMALL = (
-    24,
-    256,
-)  # side and number of the small images by which it is seen whether the camera moved
+# side and number of the small images by which it is seen whether the camera moved
+SMALL_PX, MOST_SMALL = 24, 256
 MOVED = 0.25
 """Change of the median pixel that is not black, in standard deviations of the image, from which on the camera moved.
 

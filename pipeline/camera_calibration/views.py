@@ -23,7 +23,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import distance_px
 from duagc.pipeline.recording import RgbdLog, open_rgbd
 from duagc.pipeline.registration.definition import SAME_SURFACE
-from duagc.pipeline.registration.features import DIMENSIONS, matches, root_sift
+from duagc.pipeline.registration.features import gray_of, matches, nearest_pixel, strongest_keypoints
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.runs.folder import RobotRun
 
@@ -204,8 +204,6 @@ class _Image:
 
 def _image(log: RgbdLog, index: int) -> _Image | None:
     """Features and surfaces of a frame; None if its depth shows too little of a surface, or another time."""
-    import cv2
-
     frame = log.frame(index)
     if abs(frame.depth_offset_ns) > MAX_OFFSET_NS:
         return None
@@ -215,22 +213,22 @@ def _image(log: RgbdLog, index: int) -> _Image | None:
     samples = _samples(normals, depth, robot=log.robot, index=index)
     if samples is None:
         return None
-    gray = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-    keypoints, found = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(gray, None)
-    pixel = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
-    if frame.mask is not None and len(pixel):
-        sizes = [k.size for k in keypoints]
-        seen = distance_px(frame.mask)[tuple(np.rint(pixel).astype(int).T[::-1])] > sizes
-        pixel, found = pixel[seen], np.asarray(found)[seen]
-    row, column = np.rint(pixel[:, 1]).astype(int), np.rint(pixel[:, 0]).astype(int)
-    none = np.zeros((0, DIMENSIONS), np.uint8)
+    mask, (height, width) = frame.mask, depth.shape
+
+    def usable(u: Array, v: Array, size: Array) -> NDArray[np.bool_]:
+        if mask is None:
+            return np.ones(len(u), dtype=bool)
+        return distance_px(mask)[nearest_pixel(v, height), nearest_pixel(u, width)] > size
+
+    found = strongest_keypoints(gray_of(frame.color), FEATURES, usable)
+    u, v = found.pixels.T
     w = pyramid.levels[0].inverse_depth
     return _Image(
         frame=index,
         late_s=-1e-9 * frame.depth_offset_ns,
-        pixel=pixel,
-        descriptors=root_sift(np.asarray(found, dtype=np.float32)) if len(pixel) else none,
-        depth=depth[row, column].astype(np.float64),
+        pixel=found.pixels,
+        descriptors=found.descriptors,
+        depth=depth[nearest_pixel(v, height), nearest_pixel(u, width)].astype(np.float64),
         inverse_depth=np.where(w > 0, w, np.float32(np.nan)),
         normals=normals,
         samples=samples,

@@ -48,10 +48,8 @@ class FreeSpace:
         for _ in range(config.halvings):
             self._small = self._small.halved()
         self._views: list[_View] = []
-        self._poses, self._centers = (
-            np.zeros((0, 16)),
-            np.zeros((0, 3)),
-        )  # of the views: T_map_camera, center_map
+        # T_map_camera and center_map of the views, a row each
+        self._poses, self._centers = np.zeros((0, 16)), np.zeros((0, 3))
         self._known: dict[tuple[int, bytes], bytes | None] = {}
 
     def add(self, depth_m: Image, T_map_camera: Array) -> None:

@@ -25,6 +25,7 @@ from duagc.pipeline.registration.features import (
     Keypoints,
     brightened,
     matches_of,
+    nearest_pixel,
     squared_distances,
     strongest_keypoints,
 )
@@ -75,7 +76,9 @@ def extract_rectified(gray: NDArray[np.uint8], pyramid: RgbdPyramid, most: int, 
     response = np.concatenate([np.zeros(0), *(k.responses for k in found)])
     order = np.lexsort((pixels[:, 0], pixels[:, 1], -response))[:most]
     u, v = pixels[order].T
-    depth_m = 1 / fine.inverse_depth[_nearest(v), _nearest(u)].astype(np.float64)
+    depth_m = 1 / fine.inverse_depth[
+        nearest_pixel(v, fine.camera.height), nearest_pixel(u, fine.camera.width)
+    ].astype(np.float64)
     points = back_project(fine.camera, u, v, depth_m)
     return Features(descriptors[order], points.astype(np.float32))
 
@@ -114,10 +117,10 @@ def _features_of(gray: NDArray[np.uint8], pyramid: RgbdPyramid, facing: _Facing,
 
     def usable(u: Array, v: Array, size: Array) -> masks.Mask:
         inside = (u >= 1) & (v >= 1) & (u <= fine.camera.width - 2) & (v <= fine.camera.height - 2)
-        row, column = (_nearest(np.where(inside, at, 0)) for at in (v, u))
+        row, column = nearest_pixel(v, fine.camera.height), nearest_pixel(u, fine.camera.width)
         coarse = tuple(
-            np.minimum(at // halvings, size - 1)
-            for at, size in zip((row, column), facing.members.shape, strict=True)
+            np.minimum(at // halvings, end - 1)
+            for at, end in zip((row, column), facing.members.shape, strict=True)
         )
         good = inside & facing.members[coarse] & (fine.inverse_depth[row, column] > 0)
         return good if fine.mask is None else good & (masks.distance_px(fine.mask)[row, column] > size)
@@ -221,7 +224,3 @@ def _at_one_place(points: Array) -> NDArray[np.bool_]:
 def _dot(a: Array, b: Array) -> Array:
     """Products of vectors [..., k], term by term: the same on every processor."""
     return np.asarray(sum(a[..., k] * b[..., k] for k in range(a.shape[-1])))
-
-
-def _nearest(at: Array) -> NDArray[np.int64]:
-    return np.rint(at).astype(np.int64)
