@@ -11,13 +11,13 @@ from typing import Any
 
 from duagc.converters.layouts.ros_images import is_depth, is_unusable
 from duagc.converters.logs.files import Log, is_below
+from duagc.converters.logs.video import is_video
 from duagc.pipeline.base.errors import DuagError, closest
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
-MOST_TRIED = 30  # images of a topic that are read to find one that is sound
-VIDEO = ("CompressedVideo", "FFMPEGPacket")  # how the names of schemas of video end
+MOST_TRIED, MOST_PACKETS = 30, 1000  # images, and packets of video, that are read to find one that is sound
 PACKETS = (
     "CustomMsg",
     "VelodyneScan",
@@ -72,9 +72,7 @@ class Chooser:
             wanted: topics by name of the option ("color", ...), "" = not given.
         """
         self.log, self.namespace, self._wanted = log, namespace.rstrip("/"), dict(wanted or {})
-        self.images: dict[str, Any] = {
-            t: first_usable(log, t) for t in log.of_type(*IMAGE_TYPES, below=self.namespace)
-        }
+        self.images: dict[str, Any] = {t: first_usable(log, t) for t in image_topics(log, self.namespace)}
         self.infos = log.of_type(INFO_TYPE, below=self.namespace)
         self.clouds = log.of_type(POINTS_TYPE, below=self.namespace)
 
@@ -82,12 +80,7 @@ class Chooser:
         """Images that are not depth, and are not named so."""
         found = [t for t, m in self.images.items() if not is_depth(m) and not self._is_named_depth(t)]
         left = LEFT if self._wanted.get("depth_from") == "stereo" else ()
-        choice = self._one("color", found, (*left, "color", "rgb"))
-        return (
-            choice
-            if choice.topic
-            else replace(choice, why=choice.why + video_words(self.log, self.namespace))
-        )
+        return self._one("color", self._without_video(found), (*left, "color", "rgb"))
 
     def depth(self) -> Choice:
         """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does.
@@ -98,7 +91,8 @@ class Chooser:
         if source == "stereo":
             left = self.color().topic
             others = [t for t, m in self.images.items() if t != left and not is_depth(m)]
-            return self._one("depth", [t for t in others if not self._is_named_depth(t)], RIGHT, "right")
+            others = [t for t in others if not self._is_named_depth(t)]
+            return self._one("depth", self._without_video(others), RIGHT, "right")
         if source == "lidar":
             if not self.clouds:
                 return Choice("", f"no topic holds {POINTS_TYPE}{packet_words(self.log, self.namespace)}")
@@ -136,6 +130,10 @@ class Chooser:
                 return Choice("", f"{image_topic} has CameraInfo on no topic", expected=stated)
             return Choice("", f"{image_topic} has CameraInfo on {', '.join(self.infos)}", tuple(self.infos))
         return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
+
+    def _without_video(self, topics: Sequence[str]) -> Sequence[str]:
+        """Topics of images, if there are any: video often repeats them, with losses."""
+        return [t for t in topics if not is_video(self.log.topics[t].type)] or topics
 
     def _is_named_depth(self, topic: str) -> bool:
         """Whether a topic is named as depth; the name of a sensor of both (/depth_cam/rgb) does not count."""
@@ -197,6 +195,17 @@ def _has(topic: str, hint: str) -> bool:
     return re.search(rf"(?<![a-z0-9]){hint}(?![a-z0-9])", topic.lower()) is not None
 
 
+def image_topics(log: Log, namespace: str = "") -> list[str]:
+    """Names of topics of images or video that have messages.
+
+    Args:
+        log: the log.
+        namespace: only topics below it.
+    """
+    kinds = {topic.type for topic in log.topics.values()}
+    return log.of_type(*IMAGE_TYPES, *filter(is_video, kinds), below=namespace)
+
+
 def first_usable(log: Log, topic: str) -> Any:
     """The first image of a topic that can be read; the very first if none of some can be.
 
@@ -204,24 +213,11 @@ def first_usable(log: Log, topic: str) -> Any:
         log: the log.
         topic: of images.
     """
-    for entry in itertools.islice(log.entries(topic), MOST_TRIED):
+    most = MOST_PACKETS if is_video(log.topics[topic].type) else MOST_TRIED
+    for entry in itertools.islice(log.entries(topic), most):
         if not is_unusable(message := entry.read()):
             return message
     return log.first(topic)
-
-
-def video_words(log: Log, namespace: str) -> str:
-    """What to add to a complaint that there are no images: topics that hold them as video."""
-    found = sorted(
-        f"{t.name} ({t.schema})"
-        for t in log.topics.values()
-        if t.schema.endswith(VIDEO) and t.count and is_below(t.name, namespace)
-    )
-    if not found:
-        return ""
-    return (
-        f"; {', '.join(found)} is video, which is not read: republish or export it as JPEG, PNG or raw images"
-    )
 
 
 def packet_words(log: Log, namespace: str) -> str:

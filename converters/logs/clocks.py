@@ -28,6 +28,7 @@ from duagc.converters.logs.entries import NANOSECONDS, stamp_ns
 from duagc.converters.logs.files import Log, is_below
 from duagc.converters.logs.frames import TF_TYPES
 from duagc.converters.logs.motion import IMU_TYPE
+from duagc.converters.logs.video import is_video
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import so3
@@ -239,7 +240,7 @@ def _sender(topic: str, a: RobotClock, b: RobotClock) -> int:
 def _tells_time(log: Log, topic: str) -> bool:
     """Whether the messages of a topic may be known again in another log: they hold a time, and are small."""
     known = log.topics[topic]
-    if known.type in UNSHARED or not known.count:
+    if known.type in UNSHARED or is_video(known.type) or not known.count:
         return False
     try:
         return known.type == CLOCK_TYPE or hasattr(log.first(topic), "header")

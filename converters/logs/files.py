@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from duagc.converters.logs.entries import Entry, LogTopic
+from duagc.converters.logs.video import images, is_video
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording.names import LOG_RECORD, MAGIC
 
@@ -73,12 +74,17 @@ class Log:
 
     def entries(self, *topics: str, heads: Collection[str] = ()) -> Iterator[Entry]:
         """Messages of these topics, in order of recording over all parts; heads: see `LogPart.entries`."""
+        films = {t for t in topics if t in self.topics and is_video(self.topics[t].type)} - set(heads)
         streams = [
             part.entries(wanted, [t for t in wanted if t in heads])
             for part in self.parts
-            if (wanted := [t for t in topics if t in part.topics])
+            if (wanted := [t for t in topics if t in part.topics and t not in films])
         ]
-        return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda entry: entry.log_ns)
+        for topic in sorted(films):
+            streams.append(
+                images(_merged([part.entries([topic]) for part in self.parts if topic in part.topics]))
+            )
+        return _merged(streams)
 
     def first(self, topic: str) -> Any:
         """The first message of a topic."""
@@ -86,6 +92,11 @@ class Log:
         if entry is None:
             raise DuagError(f"{self.name}: {topic} has no message, expected one")
         return entry.read()
+
+
+def _merged(streams: Sequence[Iterator[Entry]]) -> Iterator[Entry]:
+    """Messages in order of recording."""
+    return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda entry: entry.log_ns)
 
 
 def is_own_log(path: Path) -> bool:

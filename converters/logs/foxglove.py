@@ -1,6 +1,6 @@
 """Messages of Foxglove's schemas with the fields that ROS has for the same things, from protobuf, JSON or ROS.
 
-Foxglove has no schema for an IMU, and video (`foxglove.CompressedVideo`) is not read.
+Foxglove has no schema for an IMU.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from duagc.pipeline.base.errors import DuagError
 
 ROS_TYPES = {
     "foxglove.CompressedImage": "sensor_msgs/msg/CompressedImage",
+    "foxglove.CompressedVideo": "foxglove_msgs/msg/CompressedVideo",
     "foxglove.RawImage": "sensor_msgs/msg/Image",
     "foxglove.CameraCalibration": "sensor_msgs/msg/CameraInfo",
     "foxglove.FrameTransform": "tf2_msgs/msg/TFMessage",
@@ -258,6 +259,7 @@ def _point_cloud(m: Any) -> Fields:
 
 _MAKERS: dict[str, Callable[[Any], Fields]] = {
     "foxglove.CompressedImage": _compressed_image,
+    "foxglove.CompressedVideo": _compressed_image,
     "foxglove.RawImage": _raw_image,
     "foxglove.CameraCalibration": _calibration,
     "foxglove.FrameTransform": _transforms,

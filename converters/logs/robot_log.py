@@ -21,7 +21,7 @@ from duagc.converters.logs.cameras import (
     stated,
     stated_camera,
 )
-from duagc.converters.logs.choice import Chooser, video_words
+from duagc.converters.logs.choice import Chooser
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
@@ -71,8 +71,7 @@ class RobotLog:
         chooser = Chooser(self.log, self.namespace, s.model_dump())
         if not chooser.images:
             where = f" below {self.namespace}" if self.namespace else ""
-            video = video_words(self.log, self.namespace)
-            raise DuagError(f"{self.name}: found no topic of images{where}, expected color and depth{video}")
+            raise DuagError(f"{self.name}: found no topic of images{where}, expected color and depth")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.settings = s = as_stated(self.log, self.depth, s, own=self._own)

@@ -154,24 +154,3 @@ def test_broken_json_of_ros_is_one_line(change: Callable[[dict[str, Any]], Any],
         ros_json.read("sensor_msgs/msg/Image", json.dumps(members).encode(), "log.mcap: /image")
     assert str(caught.value).startswith("log.mcap: /image")
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("others", [True, False])
-def test_video_is_refused_by_its_name(tmp_path: Path, others: bool) -> None:
-    r = Ros(2)
-    path = tmp_path / "log.mcap"
-    rows = [row for row in scene(r) if others and not row[0].endswith("color/image_raw")]
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        schema = writer.register_schema("foxglove.CompressedVideo", "protobuf", b"")
-        writer.add_message(writer.register_channel("/cam/video", "protobuf", schema), 1, b"x", 1)
-        for topic, log_ns, message in rows:
-            name, encoding, text, data = encoded(message, "cdr", r)
-            number = writer.register_channel(topic, "cdr", writer.register_schema(name, encoding, text))
-            writer.add_message(number, log_ns, data, log_ns)
-        writer.finish()
-    with pytest.raises(
-        DuagError, match=r"/cam/video \(foxglove.CompressedVideo\) is video, which is not read"
-    ):
-        registry.convert("ros", path, tmp_path / "rec")

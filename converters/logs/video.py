@@ -1,0 +1,154 @@
+"""Video in logs: packets of H.264, H.265 or VP9, read as the images that they show.
+
+A picture needs those before it, back to one that needs none. Packets from one such to the next are decoded together,
+by the FFmpeg within OpenCV. The video of Foxglove and of `ffmpeg_image_transport` is read.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from types import SimpleNamespace as Fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.converters.logs.entries import Entry
+
+_CODECS = {"264": "h264", "265": "h265", "hevc": "h265", "vp9": "vp9"}
+"""By what the name of a format or of an encoder holds ("h264", "libx264", "hevc_nvenc")."""
+_KEY_UNITS = {"h264": range(5, 6), "h265": range(16, 22)}
+"""Types of the units (NAL) of pictures that need no other."""
+
+
+def is_video(kind: str) -> bool:
+    """Whether messages of a type are packets of video; the type is ROS's name of it."""
+    return kind.endswith(("/CompressedVideo", "/FFMPEGPacket"))
+
+
+def images(packets: Iterator[Entry]) -> Iterator[Entry]:
+    """The same messages, read as raw images of ROS.
+
+    What cannot be decoded is read as a compressed image of a format that no decoder knows, which says why.
+
+    Args:
+        packets: messages that `is_video`, of one topic, in order of recording.
+    """
+    part: list[Entry] = []
+    for packet in packets:
+        if _begins(packet):
+            yield from _Part(part).entries()
+            part = []
+        part.append(packet)
+    yield from _Part(part).entries()
+
+
+class _Part:
+    """Packets from a picture that needs no other to the next such; decoded in turn, and again for an earlier one."""
+
+    def __init__(self, packets: Sequence[Entry]) -> None:
+        self._packets = packets
+        self._film: Any = None
+        self._next = 0
+        self._picture: NDArray[np.uint8] | None = None
+
+    def entries(self) -> Iterator[Entry]:
+        """The packets, read as images."""
+        for index, packet in enumerate(self._packets):
+            yield replace(packet, read=partial(self._read, index))
+
+    def _read(self, index: int) -> Fields:
+        """The image of a packet."""
+        packet = self._packets[index].read()
+        picture = None if self._fault else self._shown(self._places[index])
+        if picture is None:
+            why = self._fault or "of which a picture cannot be decoded"
+            return Fields(header=packet.header, format=f"{_name(packet)} {why}", data=bytes(packet.data))
+        height, width = picture.shape[:2]
+        return Fields(
+            header=packet.header,
+            height=height,
+            width=width,
+            encoding="bgr8",
+            is_bigendian=0,
+            step=3 * width,
+            data=picture.reshape(-1),
+        )
+
+    @cached_property
+    def _fault(self) -> str:
+        """Why the packets have no images; empty if they have."""
+        first = self._packets[0].read()
+        if _codec(first) is None:
+            return "that is not read"
+        if not _begins(self._packets[0]):
+            return "before the first picture that needs no other"
+        film, count = self._opened(), 0
+        while film.isOpened() and film.grab():
+            count += 1
+        found, wanted = f"{count} pictures", f"{len(self._packets)} packets"
+        return "" if count == len(self._packets) else f"with {found} in {wanted}"
+
+    @cached_property
+    def _places(self) -> dict[int, int]:
+        """Which picture each packet shows: they are shown in order of time, whatever needs which."""
+        in_time = sorted(range(len(self._packets)), key=lambda k: self._packets[k].header_ns())
+        return {index: place for place, index in enumerate(in_time)}
+
+    def _shown(self, place: int) -> NDArray[np.uint8] | None:
+        """Colors [h, w, 3] (BGR) of a picture; None if it cannot be decoded."""
+        if self._film is None or place < self._next - 1:
+            self._film, self._next = self._opened(), 0
+        while self._next <= place:
+            self._picture = self._film.read()[1]
+            self._next += 1
+        return self._picture
+
+    def _opened(self) -> Any:
+        """A decoder before the first picture."""
+        import cv2
+
+        stream: Any = io.BytesIO(self._content)
+        return cv2.VideoCapture(stream, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+
+    @cached_property
+    def _content(self) -> bytes:
+        """The packets as a file: H.264 and H.265 one after another, VP9 in an IVF."""
+        packets = [packet.read() for packet in self._packets]
+        found = [bytes(packet.data) for packet in packets]
+        if _codec(packets[0]) != "vp9":
+            return b"".join(found)
+        numbers = struct.pack("<HHIII", 0, 0, 30, 1, len(found))  # size and rate, which nobody reads
+        head = b"DKIF" + struct.pack("<HH", 0, 32) + b"VP90" + numbers + bytes(4)
+        return head + b"".join(struct.pack("<IQ", len(data), k) + data for k, data in enumerate(found))
+
+
+def _begins(entry: Entry) -> bool:
+    """Whether a packet holds a picture that needs no other."""
+    packet = entry.read()
+    codec, data = _codec(packet), bytes(packet.data)
+    if codec is None:
+        return False
+    if codec == "vp9":  # bits: 10, profile, shows an old picture, needs others
+        return bool(data) and data[0] >> 6 == 2 and not data[0] & 0b1100
+    shift, mask = (0, 31) if codec == "h264" else (1, 63)
+    at = data.find(b"\x00\x00\x01")
+    while 0 <= at < len(data) - 3:
+        if data[at + 3] >> shift & mask in _KEY_UNITS[codec]:
+            return True
+        at = data.find(b"\x00\x00\x01", at + 3)
+    return False
+
+
+def _name(packet: Any) -> str:
+    """What a packet says of its format."""
+    return str(packet.format if hasattr(packet, "format") else packet.encoding)
+
+
+def _codec(packet: Any) -> str | None:
+    """The codec of a packet; None if it is not read."""
+    return next((codec for word, codec in _CODECS.items() if word in _name(packet).lower()), None)

@@ -1,0 +1,225 @@
+"""Color as video: every packet is read as the image that it shows, or says why it has none."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from duagc.converters import registry
+from duagc.converters.layouts.ros_images import is_unusable
+from duagc.converters.logs import open_log
+from duagc.converters.logs.entries import Entry, stamp_ns
+from duagc.converters.logs.video import images
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording import open_rgbd
+from tests.fixtures.foreign_mcap import Row, write
+from tests.fixtures.ros_bags import Ros, scene
+from tests.fixtures.video_packets import packets, planes_of, shown
+
+COLOR = "/camera/color/image_raw"
+NEAR = 4  # of 255: the decoder computes colors with fewer digits
+FFMPEG = """std_msgs/Header header
+int32 width
+int32 height
+string encoding
+uint64 pts
+uint8 flags
+bool is_bigendian
+uint8[] data
+"""
+
+
+def colors_of(rows: list[Row]) -> list[NDArray[np.uint8]]:
+    """Images [h, w, 3] (RGB) of the color of a log."""
+    return [
+        np.asarray(m.data).reshape(m.height, m.step)[:, : 3 * m.width].reshape(m.height, m.width, 3)
+        for topic, _, m in rows
+        if topic == COLOR
+    ]
+
+
+def as_video(rows: list[Row], film: list[bytes], r: Ros, kind: str, name: str = "h264") -> list[Row]:
+    """The same log with packets in place of images."""
+    if kind == "FFMPEGPacket":
+        from rosbags.typesys import get_types_from_msg
+
+        r.store.register(get_types_from_msg(FFMPEG, "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"))
+    left, found = list(film), list[Row]()
+    for topic, log_ns, m in rows:
+        if topic != COLOR:
+            found.append((topic, log_ns, m))
+        elif left:
+            data = np.frombuffer(left.pop(0), np.uint8)
+            message = SimpleNamespace(
+                __msgtype__="foxglove_msgs/msg/CompressedVideo", header=m.header, format=name, data=data
+            )
+            if kind == "FFMPEGPacket":
+                message = r.make(
+                    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+                    header=m.header,
+                    width=m.width,
+                    height=m.height,
+                    encoding=name,
+                    pts=0,
+                    flags=0,
+                    is_bigendian=False,
+                    data=data,
+                )
+            found.append(("/camera/color/video", log_ns, message))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "every"),
+    [("protobuf", "h264", 3), ("json", "h264", 1), ("FFMPEGPacket", "libx264;yuv420p;bgr8", 99)],
+)
+def test_a_log_with_video_is_the_log_with_its_images(
+    tmp_path: Path, kind: str, name: str, every: int
+) -> None:
+    r = Ros(2)
+    rows = scene(r)
+    planes = [planes_of(color) for color in colors_of(rows)]
+    video = as_video(rows, packets(planes, every), r, kind, name)
+    log = write(tmp_path / "log.mcap", video, "cdr" if kind == "FFMPEGPacket" else kind, r)
+    registry.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
+    left = list(planes)
+    raw = [
+        (
+            topic,
+            t,
+            r.image(stamp_ns(m), m.header.frame_id, shown(left.pop(0)), "rgb8") if topic == COLOR else m,
+        )
+        for topic, t, m in rows
+    ]
+    plain_log = write(tmp_path / "plain.mcap", raw, "cdr", r)
+    registry.convert("ros", plain_log, tmp_path / "plain", options=["truth=/odom"])
+    with (
+        open_rgbd(tmp_path / "rec" / "alpha.mcap") as found,
+        open_rgbd(tmp_path / "plain" / "alpha.mcap") as plain,
+    ):
+        assert len(found) == len(plain) == len(planes)
+        for index in range(len(planes)):
+            frame, same = found.frame(index), plain.frame(index)
+            assert frame.stamp_ns == same.stamp_ns
+            np.testing.assert_array_equal(frame.depth, same.depth)
+            assert np.abs(frame.color.astype(int) - same.color).max() <= NEAR
+
+
+def entries_of(film: list[bytes], name: str = "h264", order: list[int] | None = None) -> list[Entry]:
+    """Packets; order: of the times in their headers."""
+
+    def entry(index: int, data: bytes) -> Entry:
+        stamp = (order or list(range(len(film))))[index]
+        header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp, nanosec=0))
+        packet = SimpleNamespace(header=header, format=name, data=data)
+        return Entry("/video", index, None, data, lambda: packet, lambda: stamp * 10**9)
+
+    return [entry(index, data) for index, data in enumerate(film)]
+
+
+@pytest.fixture(scope="module")
+def film() -> list[NDArray[np.uint8]]:
+    """Seven images [48, 36, 3] (RGB), of which no side is a whole number of macroblocks."""
+    random = np.random.default_rng(3)
+    start = cv2.resize(random.integers(0, 255, (6, 5, 3)).astype(np.uint8), (36, 48))
+    images = []
+    for index in range(7):
+        image = np.asarray(start).copy()
+        image[4:20, 4 * index : 4 * index + 10] = (30, 220, 140)
+        images.append(image)
+    return images
+
+
+def picture(message: Any) -> NDArray[np.int64]:
+    """Colors [h, w, 3] (RGB) of a raw image."""
+    return np.asarray(message.data).reshape(message.height, message.width, 3)[..., ::-1].astype(np.int64)
+
+
+def test_images_may_be_read_in_any_order(film: list[NDArray[np.uint8]]) -> None:
+    planes = [planes_of(image) for image in film]
+    found = list(images(iter(entries_of(packets(planes, 4)))))
+    for index in (0, 1, 5, 6, 2, 2, 6, 0, 3):
+        difference = np.abs(picture(found[index].read()) - shown(planes[index]))
+        assert difference.max() <= NEAR, index
+
+
+def test_what_comes_before_the_first_whole_picture_is_unusable(film: list[NDArray[np.uint8]]) -> None:
+    planes = [planes_of(image) for image in film]
+    found = list(images(iter(entries_of(packets(planes, 4)[1:]))))
+    assert [is_unusable(entry.read()) for entry in found] == [True] * 3 + [False] * 3
+    assert found[0].read().format == "h264 before the first picture that needs no other"
+
+
+def test_a_part_that_lost_a_picture_is_unusable_and_the_next_is_not(film: list[NDArray[np.uint8]]) -> None:
+    whole = packets([planes_of(image) for image in film], 4)
+    whole[2] = b"\x00\x00\x00\x01\x09\xf0"  # begins a picture of which nothing follows
+    found = list(images(iter(entries_of(whole))))
+    assert [is_unusable(entry.read()) for entry in found] == [True] * 4 + [False] * 3
+    assert found[0].read().format == "h264 with 3 pictures in 4 packets"
+
+
+def test_pictures_are_shown_in_order_of_time(film: list[NDArray[np.uint8]]) -> None:
+    """The times in the headers are those of the images, packets come as the decoder needs them."""
+    planes = [planes_of(image) for image in film[:3]]
+    found = list(images(iter(entries_of(packets(planes, 3), order=[0, 2, 1]))))
+    for index, shows in enumerate((0, 2, 1)):
+        assert np.abs(picture(found[index].read()) - shown(planes[shows])).max() <= NEAR
+
+
+def test_vp9(tmp_path: Path, film: list[NDArray[np.uint8]]) -> None:
+    path = tmp_path / "film.ivf"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"VP90"), 30.0, (36, 48))
+    assert writer.isOpened()
+    for image in film:
+        writer.write(np.ascontiguousarray(image[..., ::-1]))
+    writer.release()
+    content, at, film_packets = path.read_bytes(), 32, []
+    while at < len(content):
+        (size,) = struct.unpack_from("<I", content, at)
+        film_packets.append(content[at + 12 : at + 12 + size])
+        at += 12 + size
+    assert len(film_packets) == len(film)
+    found = list(images(iter(entries_of(film_packets, "vp9"))))
+    errors = [np.abs(picture(e.read()) - image).mean() for e, image in zip(found, film, strict=True)]
+    assert max(errors) < 12  # lossy
+    wrong = [np.abs(picture(found[0].read()) - image).mean() for image in film[2:]]
+    assert min(wrong) > 1.5 * errors[0]
+
+
+def test_h265_begins_where_a_picture_needs_no_other() -> None:
+    """The parts; there is no encoder here."""
+    units = {"parameters": 32, "whole": 19, "open": 21, "part": 1}
+    film = [
+        b"".join(b"\x00\x00\x01" + bytes([units[name] << 1, 1, 7]) for name in names.split())
+        for names in ("part", "parameters whole", "part", "open", "part")
+    ]
+    found = [entry.read().format for entry in images(iter(entries_of(film, "hevc_nvenc")))]
+    assert found == [
+        "hevc_nvenc before the first picture that needs no other",
+        *["hevc_nvenc with 0 pictures in 2 packets"] * 4,
+    ]
+
+
+def test_video_that_is_not_read_is_refused_by_its_format(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = scene(r)
+    log = write(tmp_path / "log.mcap", as_video(rows, [b"x"] * 3, r, "protobuf", "av1"), "protobuf", r)
+    with pytest.raises(DuagError, match=r"/camera/color/video: 1 bytes of format 'av1 that is not read'"):
+        registry.convert("ros", log, tmp_path / "rec")
+
+
+def test_images_count_before_video_of_them(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = scene(r)
+    video = [row for row in as_video(rows, [b"x"] * 3, r, "protobuf", "av1") if row[0].endswith("video")]
+    log = write(tmp_path / "log.mcap", rows + video, "protobuf", r)
+    registry.convert("ros", log, tmp_path / "rec")
+    with open_log([log]) as opened:
+        assert opened.topics["/camera/color/video"].count == 3
