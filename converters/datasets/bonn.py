@@ -60,7 +60,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         CAMERA,
         DEPTH_SCALE,
         distortion=DISTORTION if settings.undistort else (),
-        sensors={"moving_objects": "in color and depth; no masks"},
+        sensors={"moving_objects": "in color and depth; no masks"} | settings.notes,
     )
     image_folder.write_parts(
         out, "bonn", src, clip, robots=robots, options=settings, warnings=warnings, force=force

@@ -79,7 +79,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         camera,
         settings.depth_scale,
         distortion=distortion if settings.undistort else (),
-        sensors={"depth": f"{sensor}, registered to color by the dataset"} | readout,
+        sensors={"depth": f"{sensor}, registered to color by the dataset"} | readout | settings.notes,
     )
     image_folder.write_parts(
         out, "tum", src, clip, robots=robots, options=settings, warnings=warnings, force=force

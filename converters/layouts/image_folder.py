@@ -247,8 +247,8 @@ def _write_clip(robot: RobotWriter, clip: Clip, images: _Images, label: str) -> 
 def _with_new_depth(frames: Sequence[FrameFiles]) -> list[bool]:
     """Whether the depth of each frame is written with it.
 
-    Depth is written once at its own time, and also with every frame that is too far from it to keep that time; frames
-    that share it come one after the other.
+    Depth is written once at its own time, or with every frame that takes it as of the frame's time; frames that share
+    it come one after the other.
     """
     written: set[Path] = set()
     new = []

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from duagc.converters.layouts.image_folder import FrameFiles, LengthOptions
 from duagc.converters.robot_writer import NANOSECONDS
@@ -21,7 +21,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.recording.pairing import TOLERANCE_NS
+from duagc.pipeline.recording.pairing import TOLERANCE_KEY, TOLERANCE_NS
 
 LAST_NS = 1 << 62  # about the year 2116
 
@@ -35,9 +35,30 @@ class AssociationOptions(Config):
     `nearest`: for each color image the nearest depth image, which may be used twice, as most published loaders do. Both
     take depth as of the time of color."""
     max_difference_s: float = Field(0.0, ge=0.0, le=3600.0)
-    """Largest difference of their times; 0: 0.1 for `all`, 0.02 for `official`, 0.08 for `nearest`."""
+    """Largest difference of their times; 0: 0.1 for `all`, its most, 0.02 for `official`, 0.08 for `nearest`."""
     max_pose_gap_s: float = Field(0.1, gt=0.0, le=3600.0)
     """Poses are interpolated between two measured ones that are no further apart; never beyond the ends."""
+
+    @model_validator(mode="after")
+    def _near(self) -> Self:
+        if self.keeps_depth_time and self.limit_ns > TOLERANCE_NS:
+            raise ValueError(
+                f"max_difference_s = {self.max_difference_s:g} with association=all, expected at most "
+                f"{TOLERANCE_NS / NANOSECONDS:g}, or --set association=nearest"
+            )
+        return self
+
+    @property
+    def keeps_depth_time(self) -> bool:
+        """Whether depth is written as of its own time; if not, as of that of its color."""
+        return self.association == "all"
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What the metadata of a log say of it: how near depth must be, if nearer than by default."""
+        if not self.keeps_depth_time or self.limit_ns == TOLERANCE_NS:
+            return {}
+        return {TOLERANCE_KEY: repr(self.limit_ns / NANOSECONDS)}
 
     @property
     def limit_ns(self) -> int:
@@ -140,11 +161,6 @@ def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
     return float(np.abs(near - times).min()) / NANOSECONDS
 
 
-def _is_near(color: Listed, depth: Listed) -> bool:
-    """Whether depth can be moved to the time of color; what is farther away the options take as of that time."""
-    return abs(depth.stamp_ns - color.stamp_ns) <= TOLERANCE_NS
-
-
 @dataclass(frozen=True)
 class Poses:
     """Measured poses: stamps_ns int64 [n], increasing, T_world_body [n, 4, 4]; how many lines were no pose."""
@@ -235,8 +251,7 @@ def frames_of(src: Path, options: SequenceOptions) -> tuple[list[FrameFiles], Po
     warnings = []
     if len(pairs) < len(color):
         warnings.append(f"{len(color) - len(pairs)} of {len(color)} color images have no depth near in time")
-    keeps_times = options.association == "all"
-    if keeps_times:
+    if options.keeps_depth_time:
         partner = {c.stamp_ns: d for c, d in pairs}
         pairs = [(c, partner.get(c.stamp_ns)) for c in color]
     truth = src / "groundtruth.txt"
@@ -252,7 +267,7 @@ def frames_of(src: Path, options: SequenceOptions) -> tuple[list[FrameFiles], Po
             c.path,
             None if d is None else d.path,
             T_world_camera=None if poses is None else poses.at(c.stamp_ns, options.max_pose_gap_s),
-            depth_stamp_ns=d.stamp_ns if keeps_times and d is not None and _is_near(c, d) else None,
+            depth_stamp_ns=d.stamp_ns if options.keeps_depth_time and d is not None else None,
             T_world_depth=None
             if poses is None or d is None
             else poses.at(d.stamp_ns, options.max_pose_gap_s),

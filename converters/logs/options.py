@@ -13,6 +13,11 @@ from duagc.converters.layouts.tum_layout import AssociationOptions
 class LogOptions(AssociationOptions, StereoOptions):
     """Topics, times and cameras; whatever is empty is found by type and name."""
 
+    @property
+    def keeps_depth_time(self) -> bool:
+        """As of `AssociationOptions`; eyes and sweeps are of one time with the color, and cannot be moved."""
+        return super().keeps_depth_time and self.depth_from == "image"
+
     color: str = ""
     """Topic of the color images."""
     depth_from: Literal["image", "stereo", "lidar"] = "image"

@@ -38,7 +38,6 @@ from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.lens import Lens, Maps
 from duagc.pipeline.geometry.masks import Mask
-from duagc.pipeline.recording.pairing import TOLERANCE_NS
 
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 LONGEST_WAIT_S = 60.0  # between color and depth of one clock
@@ -330,8 +329,7 @@ class RobotLog:
             for topic, times in self._seen.items()
         }
         settings = self.settings
-        if self.derived is not None and settings.association == "all":
-            # eyes and sweeps are of one time with the color; none of them can be moved or used twice
+        if settings.association == "all" and not settings.keeps_depth_time:  # nor can it be used twice
             settings = settings.model_copy(update={"association": "official"})
         found = associate(listed[self.color], listed[self.depth], settings)
         if not found:
@@ -340,13 +338,15 @@ class RobotLog:
             )
             other_clock = away > LONGEST_WAIT_S and settings.time_source == "header"
             remedy = "time_source=log" if other_clock else "max_difference_s=SECONDS"
+            if not other_clock and settings.keeps_depth_time:
+                remedy = f"association=nearest --set {remedy}"
             raise DuagError(
                 f"{self.name}: no image on {self.depth} within {settings.limit_ns / NANOSECONDS:g} s of one on "
                 f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set {remedy}"
             )
         pairs: dict[int, int | None] = {c.stamp_ns: d.stamp_ns for c, d in found}
         alone = [c.stamp_ns for c in listed[self.color] if c.stamp_ns not in pairs]
-        kept = self.derived is None and settings.association == "all"
+        kept = settings.keeps_depth_time
         if alone:
             end = "followed by color" if kept else "left out"
             self.warnings.append(
@@ -360,9 +360,7 @@ class RobotLog:
     def depth_stamp_ns(self, stamp_ns: int) -> int | None:
         """The time of the recording for the depth of a color image; None: there is none, or it is that of the color."""
         depth_ns = self.pairs[stamp_ns]
-        moves = self.derived is None and self.settings.association == "all"
-        # what is farther away was allowed by max_difference_s, because the times are wrong
-        if depth_ns is None or not moves or abs(depth_ns - stamp_ns) > TOLERANCE_NS:
+        if depth_ns is None or not self.settings.keeps_depth_time:
             return None
         return self.written_ns(depth_ns)
 
@@ -396,4 +394,4 @@ class RobotLog:
         """What the log says about its source."""
         moved = "registered to color by the converter" if self.T_color_depth is not None else "registered"
         moved = self.derived.words if self.derived else moved
-        return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
+        return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved} | self.settings.notes

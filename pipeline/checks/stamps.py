@@ -8,7 +8,7 @@ import numpy as np
 
 from duagc.pipeline.checks.findings import Finding, Severity
 from duagc.pipeline.config.checks import TimeChecks
-from duagc.pipeline.recording.pairing import TOLERANCE_NS, Pairing
+from duagc.pipeline.recording.pairing import Pairing
 
 
 def check_stamps(robot: str, topic: str, stamps_ns: Sequence[int], config: TimeChecks) -> Iterator[Finding]:
@@ -72,7 +72,8 @@ def check_pairs(robot: str, pairing: Pairing, config: TimeChecks) -> Iterator[Fi
             Severity.WARNING if few else Severity.NOTE,
             "pairs",
             robot,
-            f"{own} depth images for {frames} color images; {alone} have none within {TOLERANCE_NS / 1e6:g} ms",
+            f"{own} depth images for {frames} color images; {alone} have none within "
+            f"{pairing.tolerance_ns / 1e6:g} ms",
             "depth for every color image",
             f"shared depth is moved by the motion of the camera, and color without any is followed alone{advice}",
         )

@@ -19,7 +19,7 @@ from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.recording.depth_steps import COARSE_PER_M, inverse_step_per_m, without_steps
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.names import DEPTH_SCALE_KEY, RANGE_SIGMA_KEY
-from duagc.pipeline.recording.pairing import pair
+from duagc.pipeline.recording.pairing import pair_topics
 from duagc.pipeline.recording.read import LogFile, Record
 from duagc.pipeline.recording.register_depth import register_depth
 from duagc.schemas import topics as topic_table
@@ -138,7 +138,7 @@ class _Steps:
     @cached_property
     def _step_per_m(self) -> float:
         at = self._log.entries_by_time(self._topic)
-        frames = pair(self._log.entries_by_time(self._color_topic), at).pairs
+        frames = pair_topics(self._log, self._color_topic, self._topic).pairs
         held_out = {depth for index, (_, depth) in enumerate(frames) if is_held_out(index)}
         mapped = [entry for stamp, entry in sorted(at.items()) if stamp not in held_out]
         some = [mapped[k] for k in evenly_spaced(len(mapped), min(STEP_IMAGES, len(mapped)))]

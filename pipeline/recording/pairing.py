@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording.read import LOG_RECORD, LogFile
+
 TOLERANCE_NS = 100_000_000
 """Depth farther from a color image is not moved there: the camera may have turned back meanwhile."""
+TOLERANCE_KEY = "depth_tolerance_s"
+"""In the metadata of a robot's log: seconds, where depth must be nearer to its color than TOLERANCE_NS."""
 
 
 @dataclass(frozen=True)
@@ -20,11 +26,13 @@ class Pairing:
         pairs: time of color and time of its depth, ns, of every color image in order; None: it has no depth.
         color_alone: times of color images without depth.
         depth_alone: times of depth images that belong to no color image.
+        tolerance_ns: largest time between color and depth.
     """
 
     pairs: tuple[tuple[int, int | None], ...]
     color_alone: tuple[int, ...]
     depth_alone: tuple[int, ...]
+    tolerance_ns: int
 
     @property
     def offsets_ns(self) -> NDArray[np.int64]:
@@ -48,7 +56,7 @@ def pair(color_ns: Iterable[int], depth_ns: Iterable[int], tolerance_ns: int = T
     color, depth = (np.unique(np.fromiter(times, np.int64)) for times in (color_ns, depth_ns))
     if len(color) == 0 or len(depth) == 0:
         alone = tuple(color.tolist())
-        return Pairing(tuple((stamp, None) for stamp in alone), alone, tuple(depth.tolist()))
+        return Pairing(tuple((stamp, None) for stamp in alone), alone, tuple(depth.tolist()), tolerance_ns)
     nearest = _nearest(color, depth)
     near = np.abs(depth[nearest] - color) <= tolerance_ns
     pairs = tuple(
@@ -56,7 +64,36 @@ def pair(color_ns: Iterable[int], depth_ns: Iterable[int], tolerance_ns: int = T
         for stamp, partner, has in zip(color.tolist(), depth[nearest].tolist(), near.tolist(), strict=True)
     )
     unused = np.delete(depth, np.unique(nearest[near]))
-    return Pairing(pairs, tuple(color[~near].tolist()), tuple(unused.tolist()))
+    return Pairing(pairs, tuple(color[~near].tolist()), tuple(unused.tolist()), tolerance_ns)
+
+
+def pair_topics(log: LogFile, color: str, depth: str) -> Pairing:
+    """The depth of every color image of a log, within what the log allows.
+
+    Args:
+        log: of one robot.
+        color: topic of the color images.
+        depth: topic of the depth images, or of sweeps.
+
+    Raises:
+        DuagError: the log allows a time that is no tolerance.
+    """
+    return pair(log.entries_by_time(color), log.entries_by_time(depth), _tolerance_ns(log))
+
+
+def _tolerance_ns(log: LogFile) -> int:
+    text = dict(log.metadata()).get(LOG_RECORD, {}).get(TOLERANCE_KEY)
+    if text is None:
+        return TOLERANCE_NS
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 <= seconds <= TOLERANCE_NS / 1e9:
+        raise DuagError(
+            f"{log.path}: {TOLERANCE_KEY} is {text!r}, expected 0 to {TOLERANCE_NS / 1e9:g} seconds"
+        )
+    return round(seconds * 1e9)
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from duagc.pipeline.recording.color_images import ColorImages
 from duagc.pipeline.recording.depth_sources import DepthImage, check_size, constant, depth_source
 from duagc.pipeline.recording.motion import MotionPrior, motion_prior
 from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, move_depth, tracked_frames
-from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
+from duagc.pipeline.recording.pairing import pair, pair_topics
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile
 from duagc.pipeline.recording.rgbd_frame import RgbdFrame
 from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, unrollings
@@ -96,7 +96,7 @@ class RgbdLog:
         topics = self._color_topic, self._source.topic, self._mask_topic
         self._color_at = self._log.entries_by_time(*topics)
         self._depth_at = self._log.entries_by_time(self._source.topic)
-        self.pairing = pair(self._color_at, self._depth_at)
+        self.pairing = pair_topics(self._log, *topics[:2])
         self.depth_delay_ns = 0
         written = dict(self._log.metadata()).get(LOG_RECORD, {})
         self._stated_readout = Readout.stated(written, str(self.path))
@@ -105,9 +105,10 @@ class RgbdLog:
         self._motion: DepthMotion | None = None
         self.shutter: OpenShutter | None = None
         if not len(self.pairing.offsets_ns):
+            near = f"within {self.pairing.tolerance_ns / 1e6:g} ms of each other"
             raise DuagError(
                 f"{self.path}: {self._color_topic} has {len(self._color_at)} images and {self._source.topic} "
-                f"{len(self._depth_at)}, none of them within {TOLERANCE_NS / 1e6:g} ms of each other, expected pairs"
+                f"{len(self._depth_at)}, none of them {near}, expected pairs"
             )
         self._mask_at = self._read_mask_times()
 
@@ -193,7 +194,7 @@ class RgbdLog:
         moved_ns = delay_ns - self.depth_delay_ns
         self.depth_delay_ns = delay_ns
         self._depth_at = {stamp - moved_ns: entry for stamp, entry in self._depth_at.items()}
-        self.pairing = pair(self._color_at, self._depth_at)
+        self.pairing = pair(self._color_at, self._depth_at, self.pairing.tolerance_ns)
 
     def frame_offset_ns(self, index: int) -> int:
         """How much later the depth of a frame was taken; 0 if it has none.

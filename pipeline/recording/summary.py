@@ -13,7 +13,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.recording.folder import Recording
 from duagc.pipeline.recording.names import DIGEST_RECORD, LOG_RECORD, RECORDING_FILE, ROBOT_KEY
-from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
+from duagc.pipeline.recording.pairing import pair_topics
 from duagc.pipeline.recording.preview import reach, some_frames, write_preview
 from duagc.pipeline.recording.read import LogFile, parsing
 from duagc.pipeline.recording.rgbd import open_rgbd
@@ -70,9 +70,9 @@ def _pairing_warnings(log: LogFile) -> list[str]:
         depth = next((name for s in sources if log.entries(name := s.of(row[1]))), None)
         if depth is None:
             continue
-        found = pair(log.entries_by_time(topic), log.entries_by_time(depth))
+        found = pair_topics(log, topic, depth)
         if found.color_alone:
-            near = f"within {TOLERANCE_NS / 1e6:g} ms"
+            near = f"within {found.tolerance_ns / 1e6:g} ms"
             out.append(f"{topic}: {len(found.color_alone)} images have none of {depth} {near}: no depth")
         if found.depth_alone:
             out.append(f"{depth}: {len(found.depth_alone)} images are nearest to none of {topic}: not used")

@@ -110,7 +110,7 @@ def test_images_of_held_out_frames_say_nothing_of_steps(
 
     monkeypatch.setattr(depth_sources, "_depth_image", lambda *_: np.ones((4, 4), np.float32))
     camera = PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5)
-    monkeypatch.setattr(depth_sources, "pair", lambda color, depth: pair(color, depth, 0))
+    monkeypatch.setattr(depth_sources, "pair_topics", lambda log, *of: pair(*map(log.entries_by_time, of), 0))
     steps = depth_sources._Steps(Log(), "depth", 0.001, camera, robot="alpha")
     steps.smoothed(np.ones((4, 4), np.float32))
     mapped = [k for k in range(images) if k % 8 != 4 and k not in dropped]

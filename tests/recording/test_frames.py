@@ -170,6 +170,23 @@ def test_images_without_a_partner(tmp_path: Path) -> None:
     assert f"{COLOR}: 5 images have none of {DEPTH} within 100 ms: no depth" in warnings
 
 
+def test_a_log_may_ask_for_nearer_depth(tmp_path: Path) -> None:
+    path = write_camera(
+        tmp_path / "alpha.mcap", 9, skip_depth=tuple(range(1, 9)), metadata={"depth_tolerance_s": "0.05"}
+    )
+    with open_rgbd(path) as log:
+        assert log.pairing.color_alone == tuple(k * FRAME_NS for k in range(2, 9))
+        log.delay_depth(-FRAME_NS)
+        assert log.pairing.color_alone == tuple(k * FRAME_NS for k in range(3, 9))
+    assert f"{COLOR}: 7 images have none of {DEPTH} within 50 ms: no depth" in info(path)["warnings"]
+    for text in ("-1", "near", "nan", "5"):
+        write_camera(path, metadata={"depth_tolerance_s": text})
+        with pytest.raises(
+            DuagError, match=rf"alpha\.mcap: depth_tolerance_s is '{text}', expected 0 to 0\.1 s"
+        ):
+            open_rgbd(path)
+
+
 def test_color_of_a_lens_is_seen_by_the_pinhole_camera_that_the_log_states(tmp_path: Path) -> None:
     """The log holds the camera's own bytes; depth and masks are of the pinhole camera already."""
     lens = Lens(CAMERA, (0.3, -0.1, 0.01, 0.0, 0.0))

@@ -157,17 +157,42 @@ def test_association_policies(made: dict[str, tuple[Path, Path]], tmp_path: Path
     assert pairs == [(0, 8), (10, 8), (30, 12)]
 
 
-def test_depth_of_far_and_near_images_keeps_its_time(
-    made: dict[str, tuple[Path, Path]], tmp_path: Path
+@pytest.mark.parametrize(
+    ("option", "expected_ms"),
+    [
+        ("max_difference_s=0.1", [None, 81.7, 48.3, 15, -18.3, -51.7]),
+        ("max_difference_s=0.05", [None, None, 48.3, 15, -18.3, None]),
+        ("max_difference_s=0.016", [None, None, None, 15, None, None]),
+    ],
+)
+def test_depth_is_read_as_near_as_it_was_asked_for(
+    made: dict[str, tuple[Path, Path]], tmp_path: Path, option: str, expected_ms: list[float | None]
 ) -> None:
-    """Taken as of the time of an image that is too far from it, depth is there for the near ones at its own time."""
     src = tmp_path / made["tum"][0].name
     shutil.copytree(made["tum"][0], src)
     edit(src / "depth.txt", lambda text: text.splitlines()[6] + "\n")
-    registry.convert("tum", src, tmp_path / "rec", options=["max_difference_s=1"])
+    registry.convert("tum", src, tmp_path / "rec", options=[option])
     with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
-        offsets_ms = [frame.depth_offset_ns / 1e6 for frame in log.frames()]
-    assert offsets_ms == pytest.approx([0, -33.3, 48.3, 15, -18.3, -51.7], abs=0.1)
+        found_ms = [None if depth is None else (depth - color) / 1e6 for color, depth in log.pairing.pairs]
+    assert found_ms == [None if ms is None else pytest.approx(ms, abs=0.1) for ms in expected_ms]
+
+
+def test_depth_too_far_to_be_moved_is_taken_as_of_the_time_of_color(
+    made: dict[str, tuple[Path, Path]], tmp_path: Path
+) -> None:
+    src = tmp_path / made["tum"][0].name
+    shutil.copytree(made["tum"][0], src)
+    edit(src / "depth.txt", lambda text: text.splitlines()[6] + "\n")
+    options = ["max_difference_s=1"]
+    with pytest.raises(
+        DuagError, match=r"max_difference_s = 1 with association=all, expected at most 0\.1, or"
+    ):
+        registry.convert("tum", src, tmp_path / "rec", options=options)
+    (src / "groundtruth.txt").unlink()  # or the self-check sees that the times were right
+    registry.convert("tum", src, tmp_path / "rec", options=[*options, "association=nearest"])
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        assert len(log) == 6
+        assert set(log.pairing.offsets_ns.tolist()) == {0}
 
 
 def test_poses_are_interpolated_and_never_extrapolated() -> None:

@@ -178,7 +178,7 @@ def test_true_poses_of_a_transform_that_changes(tmp_path: Path) -> None:
 def test_a_real_bag_converts_when_told_that_times_differ(tmp_path: Path) -> None:
     """Color and depth are 100 ms apart; the extrinsics are those that the camera's own software recorded."""
     source = REAL / "realsense_single_depth_color.bag"
-    registry.convert("ros", source, tmp_path / "rec", options=["max_difference_s=0.2"])
+    registry.convert("ros", source, tmp_path / "rec", options=["association=nearest", "max_difference_s=0.2"])
     with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
         frame = log.frame(0)
         assert (log.camera.width, log.camera.height) == (640, 480)

@@ -67,7 +67,7 @@ def test_clocks_that_differ_by_less_than_the_log_are_warned_of(
         message = imu(r, at_ns - 1_000_000 + imu_s * 10**9, "c", np.array([0.0, 0.0, 0.3]))
         rows.append(("/imu", at_ns, message))
     bag = r.write(tmp_path / "bag", sorted(rows, key=lambda row: row[1]), "sqlite3")
-    options = ["imu=/imu", "max_difference_s=5"]
+    options = ["imu=/imu", "association=nearest", "max_difference_s=5"]
     registry.convert("ros", bag, tmp_path / "rec", options=options)
     found = [text for text in warnings_of(tmp_path / "rec") if "as if their clocks differ" in text]
     late = {DEPTH: depth_s, "/imu": imu_s}
