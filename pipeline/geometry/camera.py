@@ -7,6 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 MAX_SIDE_PX = 16_384
 """Of the images of any camera."""
+MIN_SIDE_PX = 4
+"""Of color images: a pixel is left at a quarter of their size, at which registration begins."""
 
 
 @dataclass(frozen=True)

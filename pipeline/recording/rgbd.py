@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import masks
-from duagc.pipeline.geometry.camera import MAX_SIDE_PX, PinholeCamera
+from duagc.pipeline.geometry.camera import MAX_SIDE_PX, MIN_SIDE_PX, PinholeCamera
 from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.geometry.open_shutter import OpenShutter
 from duagc.pipeline.geometry.trajectory import Trajectory
@@ -115,9 +115,10 @@ class RgbdLog:
     def _read_camera(self) -> tuple[PinholeCamera, Lens | None]:
         topic = topic_table.CALIBRATION.of(self.robot)
         camera, lens = constant(self._log, topic, messages.unpack_camera)
-        if max(camera.width, camera.height) > MAX_SIDE_PX:
+        if not all(MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
+            size = f"{camera.width} x {camera.height} px"
             raise DuagError(
-                f"{self.path}: {topic} says {camera.width} x {camera.height} px, expected sides up to {MAX_SIDE_PX}"
+                f"{self.path}: {topic} says {size}, expected sides of {MIN_SIDE_PX} to {MAX_SIDE_PX}"
             )
         first, image = self._log.entries(topic)[0][0], self._log.entries(self._color_topic)[0][0]
         if first > image:

@@ -134,6 +134,10 @@ def test_frames_stream(tmp_path: Path) -> None:
         ({"cameras": {0: CAMERA, 2: CAMERA.halved()}}, f"{CALIBRATION} changes at 66666666 ns"),
         ({"cameras": {0: CAMERA.halved()}}, f"{COLOR} at 0 ns is 16x12, expected 8x6"),
         ({"cameras": {0: PinholeCamera(16, 12, np.nan, 1, 1, 1)}}, f"{CALIBRATION}: K is"),
+        (
+            {"cameras": {0: PinholeCamera(64, 3, 60, 60, 31.5, 1)}},
+            f"{CALIBRATION} says 64 x 3 px, expected sides of 4 to 16384",
+        ),
         ({"scale": None}, f"{DEPTH}: channel metadata depth_scale is None"),
         ({"scale": "-1"}, f"{DEPTH}: channel metadata depth_scale is '-1'"),
         ({"scale": "nan"}, "depth_scale is 'nan'"),
