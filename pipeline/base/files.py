@@ -71,6 +71,17 @@ def parse_toml(text: str, path: Path, expected: str) -> dict[str, Any]:
         raise DuagError(f"{path}: not valid TOML: {error}, expected {expected}") from error
 
 
+def read_json(path: Path, expected: str) -> dict[str, Any]:
+    """The content of a file of one JSON object. Raises DuagError as `check_file` does, and if it is none."""
+    try:
+        content = json.loads(read_text(path, expected))
+    except (ValueError, RecursionError) as error:
+        raise DuagError(f"{path}: not valid JSON: {error}, expected {expected}") from error
+    if not isinstance(content, dict):
+        raise DuagError(f"{path}: found a {type(content).__name__}, expected a JSON object: {expected}")
+    return content
+
+
 def digest_of_values(values: Any) -> str:
     """64 hex characters of SHA-256 over plain values, as JSON writes them with sorted names.
 

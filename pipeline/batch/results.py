@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.component_names import submap_of
-from duagc.pipeline.base.files import new_file, read_text
+from duagc.pipeline.base.files import new_file, read_json
 from duagc.pipeline.base.templates import filled
 from duagc.pipeline.batch.cell import CellState, read_state, run_folder
 from duagc.pipeline.batch.suite import BatchCell, Suite
@@ -61,7 +60,7 @@ def numbers_of(run: Path) -> dict[str, float | str | None]:
         out[name] = value if value is None or isinstance(value, str) else float(value)  # type: ignore[arg-type]
     path = run / "timing.json"
     if path.is_file():
-        rows = list(json.loads(read_text(path, "times of a run"))["stages"].values())
+        rows = list(read_json(path, "the times of a run")["stages"].values())
         for name in ("wall_s", "cpu_s"):
             out[f"time.{name}"] = round(math.fsum(row[name] for row in rows), 3)
         out["time.peak_rss_mb"] = max(row["peak_rss_mb"] for row in rows)

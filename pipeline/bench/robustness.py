@@ -277,7 +277,7 @@ def measured(run_folder: RunFolder, recording: Recording) -> dict[str, Any]:
         run_folder: the run.
         recording: its recording, with ground truth.
     """
-    metrics = json.loads((run_folder.path / "metrics.json").read_text())
+    metrics = run_folder.metrics
     robots, own = metrics["coverage"].values(), metrics["rendering"]["own"]["held_out"]
     frames = sum(robot["frames"] for robot in robots)
     return {

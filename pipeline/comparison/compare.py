@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import check_file, read_text, read_toml
+from duagc.pipeline.base.files import check_file, read_json, read_toml
 from duagc.pipeline.comparison.fields import Unequal, unequal
 from duagc.pipeline.comparison.recordings import description_of, files_of, made_otherwise, points_of
 from duagc.pipeline.comparison.summary import ORDER, stage_of
@@ -187,10 +187,7 @@ def _content(path: Path) -> dict[str, Any]:
 
         trajectory = read_tum(path)
         return {"stamps_ns": trajectory.stamps_ns, "poses": trajectory.poses}
-    try:
-        return dict(json.loads(read_text(path, "a result of a run")))
-    except (ValueError, TypeError) as error:
-        raise DuagError(f"{path}: {error}, expected a JSON object") from error
+    return read_json(path, "a result of a run")
 
 
 def _content_of_recording(path: Path) -> dict[str, Any]:

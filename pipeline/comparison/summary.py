@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import read_json
 from duagc.pipeline.recording import log_metadata, read_log
 from duagc.pipeline.runs.digest import digest, result_files
 
@@ -169,8 +168,5 @@ def metrics_of(run_folder: Path) -> dict[str, object]:
         elif not isinstance(value, list):
             flat[name] = value
 
-    try:
-        visit("", json.loads(read_text(path, "the metrics of a run")))
-    except ValueError as error:
-        raise DuagError(f"{path}: not valid JSON: {error}") from error
+    visit("", read_json(path, "the metrics of a run"))
     return flat

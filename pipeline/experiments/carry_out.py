@@ -15,7 +15,7 @@ from typing import Any
 
 from duagc.converters.simulate.team import simulate
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import digest_of_values, new_file, read_text
+from duagc.pipeline.base.files import digest_of_values, new_file, read_json, read_text
 from duagc.pipeline.batch.batch import run_batch
 from duagc.pipeline.batch.cell import read_state, run_folder
 from duagc.pipeline.batch.engines import Engine
@@ -368,7 +368,7 @@ def _row(experiment: Experiment, cell: BatchCell, folder: Path, numbers: Mapping
 def _reason(run: Path, metric: str) -> str:
     """Why the run has no such metric, as it says itself."""
     path = run / "metrics.json"
-    grouped = json.loads(read_text(path, "the metrics of a run")).get("reasons", {}) if path.is_file() else {}
+    grouped = read_json(path, "the metrics of a run").get("reasons", {}) if path.is_file() else {}
     return reason_of(grouped, metric) or next(_matching(grouped, metric), "the run does not have it")
 
 

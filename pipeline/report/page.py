@@ -161,9 +161,7 @@ def _subtitle(metrics: dict[str, Any]) -> str:
 
 
 def _known(metrics: dict[str, Any]) -> str:
-    return {"unknown": "unknown at the start", "given": "given at the start"}[
-        metrics["protocol"]["initial_relative_poses"]
-    ]
+    return f"{metrics['protocol']['initial_relative_poses']} at the start"
 
 
 # --- paths -------------------------------------------------------------------------------------------------------

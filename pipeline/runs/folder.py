@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import read_json
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.base.unmapped import Unmapped
 from duagc.pipeline.config.base import load_config
@@ -31,6 +30,7 @@ from duagc.pipeline.messages import (
 )
 from duagc.pipeline.recording import Recording, read_exposures, read_log
 from duagc.pipeline.runs.digest import digest_file
+from duagc.pipeline.runs.metrics import sound_metrics
 from duagc.schemas import topics
 
 SCHEMA = 1  # of manifest.json
@@ -44,8 +44,6 @@ TYPES = {
     "unmapped": dict,
 }
 """What the manifest holds."""
-TABLES = ("robots", "team", "rendering", "calibration", "exchange", "consensus", "protocol", "reasons")
-"""What metrics.json holds."""
 TIMES = ("wall_s", "cpu_s", "peak_rss_mb")
 """What timing.json holds of every stage."""
 METRICS_SCHEMA = 2  # of metrics.json; 1 had a reason for every name, and other names of loop closures
@@ -310,12 +308,13 @@ class RunFolder:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """metrics.json; empty if the run was not evaluated."""
+        """metrics.json; empty if the run was not evaluated.
+
+        Raises:
+            DuagError: a table is missing or not what it should be; so does the result where a missing name is read.
+        """
         metrics = self._json("metrics.json", METRICS_SCHEMA)
-        for name in TABLES if metrics else ():
-            if not isinstance(metrics.get(name), dict):
-                raise DuagError(f"{self.path / 'metrics.json'}: found no table {name}, expected one")
-        return metrics
+        return sound_metrics(metrics, self.path / "metrics.json") if metrics else {}
 
     def _digests(self, robot: str) -> dict[str, str]:
         outputs = self._json("manifest.json").get("outputs", {})
@@ -326,12 +325,7 @@ class RunFolder:
         path = self.path / name
         if not path.is_file():
             return {}
-        try:
-            content = json.loads(read_text(path, "a JSON object"))
-        except ValueError as error:
-            raise DuagError(f"{path}: not valid JSON: {error}") from error
-        if not isinstance(content, dict):
-            raise DuagError(f"{path}: found a {type(content).__name__}, expected a JSON object")
+        content = read_json(path, "the file of a run")
         if content.get("schema", schema) != schema:
             raise DuagError(f"{path}: schema is {content['schema']}, expected {schema}")
         for key, kind in (TYPES if name == "manifest.json" else {}).items():

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -127,6 +128,48 @@ def test_what_somebody_wrote_into_a_run_is_one_line(
     (tmp_path / name).write_text(json.dumps(content))
     with pytest.raises(DuagError, match=f"{name}: {complaint}"):
         read(RunFolder(tmp_path))
+
+
+def put(metrics: dict[str, Any], name: str, value: object) -> None:
+    *tables, last = name.split(".")
+    for table in tables:
+        metrics = metrics[table]
+    if value is None:
+        del metrics[last]
+    else:
+        metrics[last] = value
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("team", [1], "found no table team"),
+        ("team.robots", None, "team.robots: found none"),
+        ("robots.alpha", 3, "robots.alpha: found a int, expected a table"),
+        ("robots.alpha.rendering", None, "robots.alpha.rendering: found none"),
+        ("rendering.own.held_out", [], "rendering.own.held_out: found a list, expected a table"),
+        (
+            "rendering.own.held_out.psnr_db",
+            "a",
+            "rendering.own.held_out.psnr_db: found a str, expected a number",
+        ),
+        ("rendering.own", None, "rendering.own: found none"),
+        ("robots.alpha", None, "robots.alpha: found none"),
+        ("exchange.bytes_sent", None, "exchange.bytes_sent: found none"),
+        ("protocol.initial_relative_poses", None, "protocol.initial_relative_poses: found none"),
+    ],
+)
+def test_no_report_of_damaged_metrics(
+    whole: fake_run.FakeRun, tmp_path: Path, name: str, value: object, complaint: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole.run, run)
+    path = run / "metrics.json"
+    metrics = json.loads(path.read_text())
+    put(metrics, name, value)
+    path.write_text(json.dumps(metrics))
+    with pytest.raises(DuagError, match=rf"run/metrics\.json: {complaint}"):
+        write_report(run, whole.recording)
 
 
 def test_a_run_that_lacks_a_whole_robot_has_no_digest(whole: fake_run.FakeRun, tmp_path: Path) -> None:
