@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -160,7 +161,17 @@ def _listen_to_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def test_an_interrupted_command_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("stop", "send"),
+    [
+        (signal.SIGINT, os.killpg),  # as a terminal does: parent and workers
+        (signal.SIGTERM, os.kill),
+        (signal.SIGHUP, os.kill),
+    ],
+)
+def test_an_interrupted_command_is_one_line(
+    tmp_path: Path, stop: signal.Signals, send: Callable[[int, int], None]
+) -> None:
     command = [sys.executable, "-c", "from duagc.pipeline.cli import main; main()", "simulate", "--out"]
     process = subprocess.Popen(
         [*command, str(tmp_path / "out")],
@@ -173,7 +184,7 @@ def test_an_interrupted_command_is_one_line(tmp_path: Path) -> None:
     deadline = time.monotonic() + 60
     while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: parent and workers
+    send(process.pid, stop)
     assert process.communicate(timeout=60)[1].splitlines() == ["duagc: interrupted"]
     assert process.returncode == 1
     assert list(tmp_path.iterdir()) == []
