@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -131,9 +132,13 @@ def _disk(out: Path) -> Found:
     folder = Path(os.path.abspath(out))
     while not folder.exists():
         folder = folder.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
+    try:
+        with tempfile.TemporaryFile(dir=folder):  # permissions do not tell: /proc has them
+            pass
+    except OSError as error:
         remedy = "duagc run --out with a folder that you may write to"
-        return Found("disk", "missing", f"{folder} cannot be written", "every run there", remedy)
+        said = f"{folder} cannot be written: {error.strerror}"
+        return Found("disk", "missing", said, "every run there", remedy)
     free = shutil.disk_usage(folder).free
     text = f"{free / 1e9:.1f} GB free in {folder}"
     if free < LEAST_DISK_BYTES:

@@ -55,3 +55,10 @@ def test_settings_that_differ_are_listed(tmp_path: Path) -> None:
     assert json.loads(duagc_here("config", "diff", path, "--json").stdout)["seed"] == [4, 0]
     path.write_text("[exchange]\nmax_round = 7\n")
     assert_one_line(duagc_here("config", "check", path), "expected perhaps exchange.max_rounds")
+
+
+@pytest.mark.parametrize("out", ["/proc/runs", "/dev/null", "/dev/null/runs"])
+def test_a_place_where_nothing_can_be_written_is_missing(out: str) -> None:
+    result = duagc_here("doctor", "--out", out)
+    assert result.returncode == 1
+    assert any(line.split()[:2] == ["missing", "disk"] for line in result.stdout.splitlines())
