@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.stop_signals import STOPPING
 
 LOW_PRIORITY = 10
 """Nice value of what can wait: a tenth of a processor is left to it next to a task that cannot."""
@@ -83,7 +84,7 @@ def start_now(pool: ProcessPoolExecutor, workers: int) -> None:
         pool: of `worker_pool`.
         workers: how many it has.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
     try:
         for _ in range(workers):
             pool.submit(_nothing)
@@ -97,7 +98,7 @@ def _nothing() -> None:
 
 def _begin(handed_down: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
     threading.Thread(target=end_with_parent, daemon=True).start()
     multiprocessing.util.Finalize(None, _end, exitpriority=LAST)
     # what it is of is imported here, and not before Ctrl-C is the parent's

@@ -1,12 +1,12 @@
 """The command `duagc`. Every command imports what it needs when it runs, so that `--help` is quick."""
 
 import errno
-import signal
 import sys
 from io import TextIOWrapper
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.stop_signals import stop_by_ending
 from duagc.pipeline.cli.common import EXIT_FAILED, app
 
 # each registers its commands, and `--help` lists them in this order
@@ -45,16 +45,13 @@ __all__ = [
 TYPER_INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
 COMPILED = ("duagc.pipeline.kernels._raster", "duagc.converters.simulate.render._flat_surfaces")
 """Modules that a source tree lacks before they are built."""
-STOPPING = (signal.SIGTERM, signal.SIGHUP)  # end a command as Ctrl-C does: it removes what is half written
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, a limit on files
 
 
 def main() -> None:
     """Entry point: one line and exit code 1 for whatever a user can fix."""
     determinism.configure_determinism()
-    for name in STOPPING:
-        if signal.getsignal(name) is signal.SIG_DFL:  # else somebody ignores it, as nohup does
-            signal.signal(name, signal.default_int_handler)
+    stop_by_ending()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")  # a terminal may lack a letter of a name

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from duagc.pipeline.base.stop_signals import STOPPING
 from duagc.pipeline.cli.common import (
     EXIT_DIFFERENT,
     ConfigFile,
@@ -61,9 +62,7 @@ def demo(
 
 def _read_code(store: Path) -> None:
     """Import what a run needs, and read its code, in a thread, while the main one does something else."""
-    signal.pthread_sigmask(
-        signal.SIG_BLOCK, {signal.SIGINT}
-    )  # Ctrl-C is the main thread's, which may hold it back
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # they are the main thread's, which may hold them back
     from duagc.pipeline.runner import read_code
 
     read_code(store)
