@@ -23,7 +23,7 @@ from duagc.converters.layouts.calibrated import correct
 from duagc.pipeline import messages
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import encode_png
+from duagc.pipeline.base.files import encode_png, new_file
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import depth_error
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -107,7 +107,8 @@ def write_calibrated(
         **calibration,
     }
     text = json.dumps(description, indent=2, allow_nan=False) + "\n"
-    (folder / RECORDING_FILE).write_text(text)
+    with new_file(folder / RECORDING_FILE) as part:
+        part.write_text(text)
 
 
 def _write_log(path: Path, out: Path, correction: Correction) -> dict[str, Any]:

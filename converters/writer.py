@@ -31,6 +31,7 @@ from duagc.converters.layouts.validity import ALL_ROBOTS, USER_MASKS
 from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.atomic_folder import RECORDING, new_folder
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import (
     RECORDING_FILE,
@@ -191,4 +192,5 @@ class RecordingWriter:
             "warnings": self.warnings,
         }
         text = json.dumps(description, indent=2, allow_nan=False) + "\n"
-        (self.folder / RECORDING_FILE).write_text(text)
+        with new_file(self.folder / RECORDING_FILE) as part:
+            part.write_text(text)

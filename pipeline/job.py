@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from duagc.pipeline import manifest, preparation, steps
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.component_names import robot_of
-from duagc.pipeline.base.files import digest_of_values
+from duagc.pipeline.base.files import digest_of_values, new_file
 from duagc.pipeline.base.thread_share import threads_per_worker
 from duagc.pipeline.base.worker_reports import Step
 from duagc.pipeline.cache.carrier import Carried, NotStoredError
@@ -125,7 +125,8 @@ class Job:
             from duagc.pipeline.evaluation import check_ground_truth
 
             check_ground_truth(self.recording)  # before minutes of work
-        (self.folder / "config.toml").write_text(dump_config(self.config))
+        with new_file(self.folder / "config.toml") as part:
+            part.write_text(dump_config(self.config))
         self.calibrate()
         for path in map(self.recording.log, self.recording.robots):
             if (found := self._digest(path)) != (expected := self.recording.digest(path.name)):

@@ -10,6 +10,7 @@ from typing import Any
 
 from duagc import __version__
 from duagc.pipeline import preparation
+from duagc.pipeline.base.files import new_file
 from duagc.pipeline.cache.carrier import Carried
 from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
 from duagc.pipeline.runs.folder import SCHEMA
@@ -103,4 +104,5 @@ def _row(carried: Carried) -> dict[str, Any]:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")
+    with new_file(path) as part:
+        part.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")

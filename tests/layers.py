@@ -185,7 +185,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "robots in processes",
             "base config runs recording cache steps watch chain run_plan preparation",
         ),
-        _part("manifest", "what a run says about itself", "cache runs preparation"),
+        _part("manifest", "what a run says about itself", "base cache runs preparation"),
     ),
     (
         _part(

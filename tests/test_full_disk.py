@@ -8,14 +8,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from duagc.pipeline import cli
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import save_array
 from duagc.pipeline.cache.store import Store
 from duagc.pipeline.runs.digest import digest, digest_file
 from duagc.pipeline.runs.stages import FUSION
 from tests.fixtures.commands import ROOT
 from tests.fixtures.full_disks import no_file_larger_than
+from tests.fixtures.recording_logs import write_camera
 from tests.fixtures.small_run import SMALL
 
 RUN = "from duagc.pipeline.cli import main; main()"
@@ -67,6 +71,20 @@ def test_fusion_that_finds_no_room_is_told_and_done_later(
     for name in ("robots/alpha/fused.ply", "robots/bravo/fused.mcap", "robots/bravo/fused.ply"):
         assert digest_file(out / name) == digest_file(small_run / name)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "store"]
+
+
+@pytest.mark.parametrize("frames", [4, 400])
+def test_a_log_that_finds_no_room_is_named(tmp_path: Path, frames: int) -> None:
+    """At the end, where all of it is in the buffer of the file, and before."""
+    path = tmp_path / "alpha.mcap"
+    with no_file_larger_than(2000), pytest.raises(OSError, match=r"/alpha\.mcap'$"):
+        write_camera(path, frames)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_array_that_finds_no_room_is_named(tmp_path: Path) -> None:
+    with no_file_larger_than(2000), pytest.raises(DuagError, match=r"/0\.npy: .*, expected room for it$"):
+        save_array(tmp_path / "0.npy", np.zeros(10_000))
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import save_array
 from duagc.pipeline.base.open3d_import import import_open3d
 
 LEVELS = 6
@@ -134,7 +135,7 @@ def _read(files: list[tuple[Path, int]], up: str, cache: Path) -> Iterator[Path]
     }
     kinds = {"triangles": np.int32, "texels": np.float32, "texture_of": np.int32, "colors": np.uint8}
     for name, values in arrays.items():
-        np.save(cache / f"{name}.npy", values.astype(kinds.get(name, np.float64)))
+        save_array(cache / f"{name}.npy", values.astype(kinds.get(name, np.float64)))
 
 
 def _limit(size: int | None) -> int:
@@ -299,7 +300,7 @@ def _store_texture(cache: Path, texture: int, image: NDArray[np.uint8]) -> None:
     """Write a texture and its mip levels, each the mean of 2 x 2 texels of the one before."""
     level = image
     for k in range(LEVELS):
-        np.save(cache / texture_file(texture, k), level)
+        save_array(cache / texture_file(texture, k), level)
         height, width = level.shape[:2]
         if min(height, width) < 2:
             return

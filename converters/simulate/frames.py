@@ -29,7 +29,7 @@ from duagc.converters.simulate.sensors.rig import BASELINE_M, MovingCamera, Rig,
 from duagc.converters.simulate.settings import Cover, SimulationSettings
 from duagc.converters.simulate.simulated_scenes import SimulatedScene
 from duagc.pipeline.base import determinism, random_streams
-from duagc.pipeline.base.files import encode_png
+from duagc.pipeline.base.files import encode_png, new_file
 from duagc.pipeline.base.workers import start_now, worker_pool
 from duagc.pipeline.geometry.camera import PinholeCamera
 
@@ -306,7 +306,8 @@ class RenderPool:
         if self._pool is None:
             return map(FrameRenderer(scene, settings).render, jobs)
         start = self._folder / "start.pickle"
-        start.write_bytes(pickle.dumps((scene.store(self._folder), settings)))
+        with new_file(start) as part:
+            part.write_bytes(pickle.dumps((scene.store(self._folder), settings)))
         left = iter(jobs)
         ahead = deque(self._pool.submit(_render, start, job) for job in islice(left, 4 * self.workers))
         return self._in_order(ahead, start, left)

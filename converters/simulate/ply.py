@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.files import new_file
+
 
 def write_points(
     path: Path, points: NDArray[np.float64], normals: NDArray[np.float64], colors: NDArray[np.uint8]
@@ -30,4 +32,5 @@ def write_points(
         "end_header",
         "",
     ]
-    path.write_bytes("\n".join(header).encode() + rows.tobytes())
+    with new_file(path) as part:
+        part.write_bytes("\n".join(header).encode() + rows.tobytes())

@@ -15,6 +15,7 @@ from duagc.converters.simulate.scenes.catalog import MESHES, SCENES, SceneSettin
 from duagc.converters.simulate.trajectories import loops, walks
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.files import save_array
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 Points = tuple[Array, Array, NDArray[np.uint8]]
@@ -111,7 +112,7 @@ class SimulatedRoom:
 
     def store(self, folder: Path) -> RoomOnDisk:
         for k, level in enumerate(self.atlas.levels):
-            np.save(folder / f"{k}.npy", level)
+            save_array(folder / f"{k}.npy", level)
         return RoomOnDisk(self.scene.seed, folder, len(self.atlas.levels), self.atlas.origin)
 
     def renderer(self, camera: PinholeCamera) -> CameraRenderer:

@@ -111,6 +111,24 @@ def new_file(path: Path) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def save_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array as .npy.
+
+    Args:
+        path: of the file.
+        array: of numbers.
+
+    Raises:
+        DuagError: it cannot be written there; numpy names neither the file nor the reason.
+    """
+    import numpy as np
+
+    try:
+        np.save(path, array)
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected room for it") from error
+
+
 def decode_image(data: bytes, flags: int) -> NDArray[Any] | None:
     """What OpenCV makes of an encoded image; None if nothing, or more pixels than `determinism` allows."""
     import cv2

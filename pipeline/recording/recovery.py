@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import struct
 from contextlib import suppress
 from dataclasses import asdict
@@ -23,7 +24,7 @@ from mcap.summary import Summary
 
 from duagc.pipeline.base.atomic_folder import RECORDING, check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import check_file, read_bytes
+from duagc.pipeline.base.files import check_file, new_file, read_bytes
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.recording import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA, open_rgbd
 from duagc.pipeline.recording.damaged_log import LARGEST_RECORD, Salvage, records_of
@@ -233,7 +234,7 @@ def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
         raise DuagError(f"{source}: found no log of a robot with frames, expected one or more")
     geometry = description.get("geometry")
     if isinstance(geometry, str) and Path(geometry).name == geometry and (source / geometry).is_file():
-        (folder / geometry).write_bytes((source / geometry).read_bytes())
+        shutil.copyfile(source / geometry, folder / geometry)
     else:
         description["geometry"] = None
     kept = {RECORDING_FILE, description["geometry"]}
@@ -242,7 +243,8 @@ def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
             salvaged.append(Salvage(path.name, damage=["is not carried over: no log, and nothing names it"]))
     description |= {"format": RECORDING_FORMAT, "schema": RECORDING_SCHEMA, "robots": robots}
     description["warnings"] = warnings
-    (folder / RECORDING_FILE).write_text(json.dumps(description, indent=2) + "\n")
+    with new_file(folder / RECORDING_FILE) as part:
+        part.write_text(json.dumps(description, indent=2) + "\n")
     return salvaged
 
 

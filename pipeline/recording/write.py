@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -154,7 +155,10 @@ class LogWriter:
                 f"{topic} at {log_time_ns} ns comes after {self._last_log_time_ns} ns in {self.path.name}"
             )
         self._last_log_time_ns = log_time_ns
-        self._writer.add_message(channel.number, log_time_ns, data, publish_time_ns, channel.sequence)
+        try:
+            self._writer.add_message(channel.number, log_time_ns, data, publish_time_ns, channel.sequence)
+        except OSError as error:
+            raise self._named(error) from error
         self._content.add(
             channel.identity, log_time_ns, publish_time_ns, sequence=channel.sequence, data=data
         )
@@ -166,16 +170,26 @@ class LogWriter:
         assert self._stream is not None
         try:
             if kind is None:
-                channels = [(c.identity, c.metadata) for c in self._channels.values()]
-                log = {LOG_RECORD: self._metadata}
-                self.digest = self._content.finish(channels, sorted(log.items()), [])
-                self._writer.add_metadata(DIGEST_RECORD, {"sha256": self.digest})
-                self._writer.finish()
-                self._stream.close()
-                os.replace(self._part, self.path)
+                self._finish(self._stream)
+        except OSError as full:
+            raise self._named(full) from full
         finally:
-            self._stream.close()
+            with suppress(OSError):  # it is removed: that the rest has no room does not matter
+                self._stream.close()
             self._part.unlink(missing_ok=True)
+
+    def _finish(self, stream: IO[bytes]) -> None:
+        channels = [(c.identity, c.metadata) for c in self._channels.values()]
+        log = {LOG_RECORD: self._metadata}
+        self.digest = self._content.finish(channels, sorted(log.items()), [])
+        self._writer.add_metadata(DIGEST_RECORD, {"sha256": self.digest})
+        self._writer.finish()
+        stream.close()
+        os.replace(self._part, self.path)
+
+    def _named(self, error: OSError) -> OSError:
+        """The error with the name of the log, which one of an open file lacks."""
+        return OSError(error.errno, error.strerror, str(self.path))
 
 
 @dataclass

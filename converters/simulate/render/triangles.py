@@ -9,6 +9,7 @@ from duagc.converters.simulate.render import bake, meshes
 from duagc.converters.simulate.render.raycast import Caster
 from duagc.converters.simulate.scenes.scene import Ball, Flat, Scene, Side, Surface
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.files import save_array
 
 SIDES = 48  # of a cylinder, a disc and the equator of a sphere; no coarser than 3 mm at 0.7 m radius
 
@@ -18,7 +19,7 @@ def write(scene: Scene, texel_m: float, cache: Path) -> None:
     vertices, coordinates, triangles, surface_of = _triangles(scene)
     atlas = bake.bake(scene, texel_m, Caster(unpainted(scene)).blocked)
     for k, level in enumerate(atlas.levels):
-        np.save(cache / meshes.texture_file(0, k), level)
+        save_array(cache / meshes.texture_file(0, k), level)
     texels = atlas.origin[surface_of][:, None] + coordinates[triangles] / texel_m
     arrays: dict[str, NDArray[np.generic]] = {
         "vertices": vertices,
@@ -28,7 +29,7 @@ def write(scene: Scene, texel_m: float, cache: Path) -> None:
         "colors": np.zeros((len(vertices), 3), dtype=np.uint8),
     }
     for name, values in arrays.items():
-        np.save(cache / f"{name}.npy", values)
+        save_array(cache / f"{name}.npy", values)
 
 
 def unpainted(scene: Scene) -> meshes.MeshScene:
