@@ -19,7 +19,7 @@ from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import MotionPrior, Recording, RgbdLog, log_metadata, open_rgbd
 from duagc.pipeline.recording.names import DIGEST_RECORD
-from duagc.pipeline.recording.read import LogFile
+from duagc.pipeline.recording.read import LogFile, verify
 
 __all__ = ["Finding", "Report", "Severity", "check", "check_registration", "format_report"]
 
@@ -59,14 +59,24 @@ def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = N
                     rgbd.check_robot(robot)
                 _check_robot(report, recording, rgbd, sights, config=config)
         except DuagError as error:
-            advice = "duagc recover may save it" if log else ""
-            report.findings.append(_unreadable(robot, error, advice))
+            report.findings.append(_unreadable(robot, error, _remedy(log)))
     report.findings += images.check_colors(sights, config.images)
     speed = measured.MachineSpeed() if store is None else measured.speed_of(Path(store))
     report.estimate = estimate.estimate(report.robots, speed.ratios) | {"measured_stages": speed.stages}
     report.findings += estimate.check_disk(path.parent, report.estimate["bytes"])
     report.findings = list(judged(report.findings, config.sure, config.likely))
     return report
+
+
+def _remedy(log: Path | None) -> str:
+    """What may help where a log cannot be read: of a sound one nothing is to be recovered."""
+    if log is None or not log.is_file():
+        return ""
+    try:
+        verify(log)
+    except DuagError:
+        return "duagc recover may save it"
+    return "duagc info says what is in it"
 
 
 def check_registration(log: Path, config: ChecksConfig = _DEFAULT) -> list[Finding]:

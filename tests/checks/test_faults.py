@@ -271,9 +271,21 @@ def test_logs_that_cannot_be_read_are_findings(sound: Path, tmp_path: Path) -> N
     assert not content["sound"]
     assert [f["robot"] for f in content["findings"] if f["severity"] == "error"] == ["alpha"]
     assert set(content["robots"]) == {"bravo"}
+    assert [f["advice"] for f in content["findings"] if f["severity"] == "error"] == [
+        "duagc recover may save it"
+    ]
     result = CliRunner().invoke(app, ["check", str(out / "bravo.mcap")])
     assert result.exit_code == 0
     assert "nothing found" in result.stdout
+
+
+def test_a_sound_log_without_a_camera_is_not_to_be_recovered(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "alpha.mcap", "alpha") as log:
+        reading = m.pack_imu(0, "alpha", np.zeros(3), np.array([0.0, 0.0, 9.8]))
+        log.write(topics.IMU.of("alpha"), reading, 0)
+    (finding,) = [f for f in check.check(tmp_path / "alpha.mcap").findings if f.severity == "error"]
+    assert "expected exactly one robot" in finding.line()
+    assert finding.advice == "duagc info says what is in it"
 
 
 def test_an_odometry_tells_the_scale(sound: Path, tmp_path: Path) -> None:
