@@ -33,7 +33,7 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
         if first["type"] == "extra_forbidden":
             hint = closest(name, list(model.model_fields), "options")
             raise DuagError(f"{dataset}: {name} is no option; {hint}") from error
-        if first["type"] == "value_error":
+        if not first["loc"]:  # of several options together
             raise DuagError(f"{dataset}: {first['ctx']['error']}") from error
         raise DuagError(f"{dataset}: {name} = {first['input']!r}: {first['msg']}") from error
 

@@ -1,4 +1,4 @@
-"""The signals by which a command is told to stop; all end it as Ctrl-C does, and it removes what is half written."""
+"""The signals by which a command is stopped; all end it as Ctrl-C does, and it removes what is half written."""
 
 import signal
 
