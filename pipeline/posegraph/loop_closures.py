@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
@@ -123,20 +124,17 @@ def consistent(
     T_own, T_peer = own.T_frame_keyframe[i], peer.T_frame_keyframe[j]
     # T_ownmap_peermap implied by each loop closure
     frames = T_own @ np.array([c.T_own_peer for c in closures], dtype=np.float64) @ se3.inverse(T_peer)
-    rotation_rad, translation_m = _disagreement(frames, T_peer[:, :3, 3])
     information = closures_as_relative_poses(closures, i, j, config).information
     closure_variance = np.linalg.inv(information + np.eye(6))
     closure_variance = np.diagonal(closure_variance, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
-    variance = closure_variance[:, None] + closure_variance[None]
-    variance = variance + np.abs(own.drift[i][:, None] - own.drift[i][None])
-    variance = variance + np.abs(peer.drift[j][:, None] - peer.drift[j][None])
-    lever_m = np.maximum(_distances(T_own[:, :3, 3]), _distances(T_peer[:, :3, 3]))
-    variance_rotation = config.margin * variance[..., 1]
-    variance_translation = config.margin * variance[..., 0] + variance_rotation * lever_m**2 / 3
-    agree = (rotation_rad**2 < CHI2_3_999 * variance_rotation) & (
-        translation_m**2 < CHI2_3_999 * variance_translation
+    agree = _agreement(
+        frames,
+        (T_own[:, :3, 3], T_peer[:, :3, 3]),
+        (own.drift[i], peer.drift[j]),
+        closure_variance,
+        margin=config.margin,
     )
-    keep = _clique(agree | agree.T)
+    keep = _clique(agree)
     support = int(keep.sum())
     if support < config.min_support:
         reason = f"largest consistent group has {support} of {m} loop closures, needs {config.min_support}"
@@ -147,7 +145,7 @@ def consistent(
     left = ~keep
     while len(others) < _OTHER_GROUPS and np.count_nonzero(left) >= config.min_support:
         group = np.zeros(m, dtype=bool)
-        group[np.flatnonzero(left)[_clique((agree | agree.T)[np.ix_(left, left)])]] = True
+        group[np.flatnonzero(left)[_clique(agree[np.ix_(left, left)])]] = True
         if group.sum() < config.min_support:
             break
         others.append(Group(group, robust_frame(frames[group], config)))
@@ -258,26 +256,39 @@ def _cauchy(frames: Array, T: Array, config: LoopClosureConfig) -> Array:
     return 1.0 / (1.0 + distance)
 
 
-def _disagreement(frames: Array, points_peermap: Array) -> tuple[Array, Array]:
-    """Angle and distance [m, m] between implied frames k and l, the distance at the place of loop closure l."""
-    R, t = frames[:, :3, :3], frames[:, :3, 3]
-    at_own = (R @ points_peermap[..., None])[..., 0] + t
-    rotation_rad, translation_m = np.empty((len(R), len(R))), np.empty((len(R), len(R)))
-    for k in (slice(first, first + _ROWS) for first in range(0, len(R), _ROWS)):
+def _agreement(
+    frames: Array, points: tuple[Array, Array], drifts: tuple[Array, Array], variance: Array, *, margin: float
+) -> NDArray[np.bool_]:
+    """Which pairs of loop closures agree, bool [m, m]: all else is computed in blocks of rows.
+
+    Args:
+        frames: [m, 4, 4], the implied relative frames.
+        points: [m, 3] each, the named keyframes of both ends in their own maps, m.
+        drifts: [m, 2] each, of these keyframes, m^2 and rad^2.
+        variance: [m, 2], of the loop closures, m^2 and rad^2.
+        margin: factor on variances.
+    """
+    m = len(frames)
+    # as one row per rotation and without gaps in memory both sums take half the time
+    R, t = np.ascontiguousarray(frames[:, :3, :3]), frames[:, :3, 3]
+    rows, points_peer = R.reshape(m, 9), points[1]
+    at_own = (frames[:, :3, :3] @ points_peer[..., None])[..., 0] + t
+    agree, near = np.empty((m, m), dtype=bool), np.empty((m, m), dtype=bool)
+    for k in (slice(first, first + _ROWS) for first in range(0, m, _ROWS)):
+        limit = variance[k, None] + variance[None]
+        for drift_m2_rad2 in drifts:
+            limit = limit + np.abs(drift_m2_rad2[k, None] - drift_m2_rad2[None])
+        lever_m = np.maximum(*(cdist(p[k], p) for p in points))
+        limit_rotation = margin * limit[..., 1]
+        limit_translation = margin * limit[..., 0] + limit_rotation * lever_m**2 / 3
         # angle of Rk' Rl from its trace's complement: |Rk - Rl|_F = 2 sqrt2 sin(angle / 2)
-        chord = np.sqrt(np.sum((R[k, None] - R[None]) ** 2, axis=(-1, -2)))
-        rotation_rad[k] = 2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0))
-        at_other = np.einsum("kab,lb->kla", R[k], points_peermap) + t[k, None]
-        translation_m[k] = np.linalg.norm(at_other - at_own[None], axis=-1)
-    return rotation_rad, np.minimum(translation_m, translation_m.T)
-
-
-def _distances(points: Array) -> Array:
-    """Distances [m, m] (m) between points [m, 3]."""
-    out = np.empty((len(points), len(points)))
-    for k in (slice(first, first + _ROWS) for first in range(0, len(points), _ROWS)):
-        out[k] = np.linalg.norm(points[k, None] - points[None], axis=-1)
-    return out
+        chord = np.sqrt(np.sum((rows[k, None] - rows[None]) ** 2, axis=-1))
+        rotation_rad = 2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0))
+        agree[k] = rotation_rad**2 < CHI2_3_999 * limit_rotation
+        # distance between the frames at the place of loop closure l, which has to be near from either side
+        at_other = np.einsum("kab,lb->kla", R[k], points_peer) + t[k, None]
+        near[k] = np.linalg.norm(at_other - at_own[None], axis=-1) ** 2 < CHI2_3_999 * limit_translation
+    return agree & (near | near.T)
 
 
 def _clique(agree: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -288,14 +299,14 @@ def _clique(agree: NDArray[np.bool_]) -> NDArray[np.bool_]:
     for start in np.argsort(-agree.sum(axis=1), kind="stable")[:10].tolist():
         clique, candidates = [start], agree[start].copy()
         candidates[start] = False
-        degrees = agree[:, candidates].sum(axis=1)  # to candidates
+        degrees = agree[candidates].sum(axis=0)  # to candidates
         while candidates.any():
             left = np.flatnonzero(candidates)
             chosen = int(left[np.argmax(degrees[left])])
             clique.append(chosen)
             kept = candidates & agree[chosen]
             kept[chosen] = False
-            degrees -= agree[:, candidates & ~kept].sum(axis=1)
+            degrees -= agree[candidates & ~kept].sum(axis=0)
             candidates = kept
         if len(clique) > len(best):
             best = clique

@@ -4,6 +4,7 @@ import time
 import tracemalloc
 
 import numpy as np
+import pytest
 
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import se3
@@ -163,20 +164,45 @@ def test_a_clique_of_many_loop_closures_is_found_in_little_time():
     assert time.process_time() - began < 2.0  # with degrees counted anew at each step it is 7 s
 
 
-def test_blocks_of_rows_change_no_bit_and_bound_the_memory(monkeypatch):
-    rng = np.random.default_rng(8)
-    m = 400
-    frames, points = random_poses(rng, m), rng.normal(size=(m, 3))
+def plain_agreement(frames, points, drifts, variance, margin):
+    """Which pairs agree, all pairs at once."""
+    R, t = frames[:, :3, :3], frames[:, :3, 3]
+    chord = np.sqrt(np.sum((R[:, None] - R[None]) ** 2, axis=(-1, -2)))
+    rotation_rad = 2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0))
+    at_other = np.einsum("kab,lb->kla", R, points[1]) + t[:, None]
+    off_m = np.linalg.norm(at_other - ((R @ points[1][..., None])[..., 0] + t)[None], axis=-1)
+    variance = variance[:, None] + variance[None]
+    for drifted in drifts:
+        variance = variance + np.abs(drifted[:, None] - drifted[None])
+    lever_m = np.maximum(*(np.linalg.norm(p[:, None] - p[None], axis=-1) for p in points))
+    rotation, translation = margin * variance[..., 1], margin * variance[..., 0]
+    agree = (rotation_rad**2 < loop_closures.CHI2_3_999 * rotation) & (
+        np.minimum(off_m, off_m.T) ** 2 < loop_closures.CHI2_3_999 * (translation + rotation * lever_m**2 / 3)
+    )
+    return agree | agree.T
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 63, 65, 130])
+def test_agreement_in_blocks_of_rows_is_that_of_all_pairs_at_once(m):
+    rng = np.random.default_rng(m)
+    frames = random_poses(rng, 1)[0] @ se3.exp(0.1 * rng.normal(size=(m, 6)))
+    points = rng.normal(size=(2, m, 3))
+    drifts, variance = rng.random((2, m, 2)) * 1e-3, rng.random((m, 2)) * 1e-3
+    given = frames, tuple(points), tuple(drifts), variance
+    expected = plain_agreement(*given, margin=1.5)
+    np.testing.assert_array_equal(loop_closures._agreement(*given, margin=1.5), expected)
+    assert m < 63 or 0.1 < expected.mean() < 0.9
+
+
+def test_pairwise_consistency_keeps_no_matrix_of_numbers():
+    m = 1200
+    closures, own, peer, grown, truth, _ = pair(9, good=m - 200, bad=200)
     tracemalloc.start()
-    disagreement = loop_closures._disagreement(frames, points)
+    found = agreeing(closures, own, peer, grown)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    blocks = [*disagreement, loop_closures._distances(points)]
-    assert peak < 9 * 8 * m**2  # of all pairs at once 13
-    monkeypatch.setattr(loop_closures, "_ROWS", m)
-    whole = [*loop_closures._disagreement(frames, points), loop_closures._distances(points)]
-    for one, other in zip(blocks, whole, strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert np.array_equal(found.keep, truth)
+    assert peak < 3 * 8 * m**2  # with such matrices it is nine of them
 
 
 def test_holder_is_the_end_that_copies_fewer_keyframes():
