@@ -8,12 +8,12 @@ is none, it cannot be decided which of them is false, and none of them counts.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
@@ -83,9 +83,10 @@ def place(pairs: Mapping[Pair, Sequence[Proposal]], robots: Sequence[str], margi
         robots: all names.
         margin: factor on variances; infinite if cycles decide nothing.
     """
-    scores = {pair: [_score(pair, k, pairs, margin) for k in range(len(pairs[pair]))] for pair in pairs}
+    detours = _all_detours(pairs, margin)
+    scores = {pair: _scores(pairs[pair], detours[pair], margin) for pair in pairs}
     best = {pair: int(np.argmax(score)) for pair, score in scores.items()}  # the first of equals
-    cycles = _cycles(pairs, margin)
+    cycles = _cycles(detours)
     support = {pair: float(scores[pair][k]) for pair, k in best.items()} | _refuted(cycles)
     frames = {pair: (pairs[pair][k].T_a_b, support[pair]) for pair, k in best.items()}
     T_world_map = chain_frames(frames, robots)
@@ -99,7 +100,8 @@ def place(pairs: Mapping[Pair, Sequence[Proposal]], robots: Sequence[str], margi
         placed = se3.inverse(T_world_map[a]) @ T_world_map[b]
         path = _path(a, b, parent)
         variance = np.array([pairs[edge][best[edge]].variance for edge in path]).sum(axis=0)
-        fits = [_closes(placed @ se3.inverse(p.T_a_b), variance + p.variance, margin) for p in proposals]
+        around = placed @ se3.inverse(np.array([p.T_a_b for p in proposals]))
+        fits = _closes(around, variance + [p.variance for p in proposals], margin).tolist()
         chosen[a, b] = fits.index(True) if any(fits) else None
         if chosen[a, b] is None:
             off_m, off_rad = (float(d) for d in se3.distance(placed, proposals[0].T_a_b))
@@ -108,40 +110,70 @@ def place(pairs: Mapping[Pair, Sequence[Proposal]], robots: Sequence[str], margi
     return Placement(T_world_map, parent, chosen, contradictions, _undecided(pairs, cycles))
 
 
-def _score(pair: Pair, k: int, pairs: Mapping[Pair, Sequence[Proposal]], margin: float) -> float:
-    """Weight of a proposal and what cycles of three robots add."""
-    a, b = pair
-    proposal = pairs[pair][k]
-    score = proposal.weight
-    if math.isinf(margin):  # every cycle closes, which is no evidence
-        return score
-    thirds = sorted({name for other in pairs for name in other} - {a, b})
-    for c in thirds:
-        confirmed = [
-            min(first.weight, second.weight)
-            for first in _proposals(pairs, a, c)
-            for second in _proposals(pairs, c, b)
-            if _agree(first, second, proposal, margin)
-        ]
-        score += max(confirmed, default=0.0)
-    return score
+@dataclass(frozen=True)
+class _Detours:
+    """Paths of a pair by a third robot, for every proposal of the one link and every one of the other.
+
+    Attributes:
+        first: by third robot, in order of the names, its first path.
+        weight: [m], of the weaker link of each path.
+        confirms: bool [m, k], whether each path ends where each of the k direct proposals does.
+    """
+
+    first: dict[str, int]
+    weight: Array
+    confirms: NDArray[np.bool_]
 
 
-def _agree(first: Proposal, second: Proposal, direct: Proposal, margin: float) -> bool:
-    """Whether the path by a third robot ends where the direct one does."""
-    variance = np.array([first.variance, second.variance, direct.variance]).sum(axis=0)
-    return _closes(first.T_a_b @ second.T_a_b @ se3.inverse(direct.T_a_b), variance, margin)
+def _all_detours(pairs: Mapping[Pair, Sequence[Proposal]], margin: float) -> dict[Pair, _Detours]:
+    """The detours of every pair."""
+    links = {(b, a): [p.reversed() for p in proposals] for (a, b), proposals in pairs.items()} | dict(pairs)
+    motions = {link: np.array([p.T_a_b for p in proposals]) for link, proposals in links.items()}
+    variances = {link: np.array([p.variance for p in proposals]) for link, proposals in links.items()}
+    weights = {link: np.array([p.weight for p in proposals]) for link, proposals in links.items()}
+    neighbors: dict[str, set[str]] = {}
+    for a, b in links:
+        neighbors.setdefault(a, set()).add(b)
+
+    out = {}
+    for a, b in pairs:
+        thirds = sorted(neighbors[a] & neighbors[b])
+        if not thirds:
+            out[a, b] = _Detours({}, np.zeros(0), np.zeros((0, len(pairs[a, b])), dtype=bool))
+            continue
+        # every first link with every second one
+        T = [(motions[a, c][:, None] @ motions[c, b]).reshape(-1, 4, 4) for c in thirds]
+        variance = [(variances[a, c][:, None] + variances[c, b]).reshape(-1, 2) for c in thirds]
+        weight = [np.minimum(weights[a, c][:, None], weights[c, b]).ravel() for c in thirds]
+        first = np.cumsum([0, *(len(w) for w in weight[:-1])])
+        around = np.concatenate(T)[:, None] @ se3.inverse(motions[a, b])
+        limit = np.concatenate(variance)[:, None] + variances[a, b]
+        out[a, b] = _Detours(
+            dict(zip(thirds, first.tolist(), strict=True)),
+            np.concatenate(weight),
+            _closes(around, limit, margin),
+        )
+    return out
 
 
-def _cycles(pairs: Mapping[Pair, Sequence[Proposal]], margin: float) -> dict[Cycle, bool]:
+def _scores(proposals: Sequence[Proposal], detours: _Detours, margin: float) -> Array:
+    """Weight of every proposal [k] of a pair and what cycles of three robots add."""
+    own = np.array([p.weight for p in proposals])
+    if math.isinf(margin) or not detours.first:  # every cycle closes, which is no evidence
+        return own
+    confirmed = np.where(detours.confirms, detours.weight[:, None], 0.0)
+    added = np.maximum.reduceat(confirmed, list(detours.first.values()), axis=0)
+    return np.cumsum([own, *added], axis=0)[-1]  # in order of the names
+
+
+def _cycles(detours: Mapping[Pair, _Detours]) -> dict[Cycle, bool]:
     """Every three robots that have all met, and whether some of their proposals close the cycle."""
-    closed = {}
-    for a, b, c in itertools.combinations(sorted({name for pair in pairs for name in pair}), 3):
-        cycle = (a, b), (b, c), (a, c)
-        if set(cycle) <= set(pairs):
-            triples = itertools.product(pairs[a, b], pairs[b, c], pairs[a, c])
-            closed[cycle] = any(_agree(ab, bc, ac, margin) for ab, bc, ac in triples)
-    return closed
+    closes: dict[tuple[str, str, str], bool] = {}
+    for (a, c), around in detours.items():
+        if around.first:
+            closed = np.logical_or.reduceat(around.confirms.any(axis=1), list(around.first.values()))
+            closes |= {(a, b, c): bool(k) for b, k in zip(around.first, closed, strict=True)}
+    return {((a, b), (b, c), (a, c)): closes[a, b, c] for a, b, c in sorted(closes) if a < b < c}
 
 
 def _confirmed(cycles: Mapping[Cycle, bool]) -> set[Pair]:
@@ -174,18 +206,11 @@ def _undecided(pairs: Mapping[Pair, Sequence[Proposal]], cycles: Mapping[Cycle, 
     return out
 
 
-def _proposals(pairs: Mapping[Pair, Sequence[Proposal]], a: str, b: str) -> list[Proposal]:
-    """Proposals of a pair as motions from b to a."""
-    if (a, b) in pairs:
-        return list(pairs[a, b])
-    return [p.reversed() for p in pairs.get((b, a), ())]
-
-
-def _closes(T: Array, variance: Array, margin: float) -> bool:
-    """Whether a motion round a cycle is none, within `margin` times its variance."""
-    distance_m, angle_rad = (float(d) for d in se3.distance(np.eye(4), T))
+def _closes(T: Array, variance: Array, margin: float) -> NDArray[np.bool_]:
+    """Whether motions [..., 4, 4] round cycles are none, within `margin` times their variance [..., 2]."""
+    distance_m, angle_rad = se3.distance(np.eye(4), T)
     limit = CHI2_3_999 * margin * variance
-    return bool(distance_m**2 < limit[0] and angle_rad**2 < limit[1])
+    return np.asarray((distance_m**2 < limit[..., 0]) & (angle_rad**2 < limit[..., 1]))
 
 
 def _path(a: str, b: str, parent: Mapping[str, str | None]) -> list[Pair]:
