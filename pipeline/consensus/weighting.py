@@ -58,9 +58,11 @@ def shared_evidence(
     known = rows >= 0
     measure = np.ones(len(full))
     if kind == "observation_count":
-        measure = np.where(known, information.observations[rows], 0).astype(np.float64)
+        measure = np.zeros(len(full))
+        measure[known] = information.observations[rows[known]]
     elif kind == "residual_magnitude":
-        measure = np.where(known, (UNIT_SIGMA_M / np.maximum(information.deviation_m[rows], 1e-6)) ** 2, 0.0)
+        measure = np.zeros(len(full), information.deviation_m.dtype)
+        measure[known] = (UNIT_SIGMA_M / np.maximum(information.deviation_m[rows[known]], 1e-6)) ** 2
     m = measure[:, None]
     return _with(
         full,

@@ -101,3 +101,11 @@ def test_what_the_sums_do_not_name_has_no_counted_weight() -> None:
         evidence = shared_evidence("alpha", gaussians, half, T_map_keyframe, kind=kind)
         assert missing.any()
         assert not evidence.information[missing].any()
+
+
+@pytest.mark.parametrize("kind", get_args(WeightKind))
+def test_sums_that_name_no_gaussian_give_no_weight(kind: WeightKind) -> None:
+    gaussians, sums, T_map_keyframe = world(5)
+    none = Seen(**{k: v[:0] if isinstance(v, np.ndarray) else v for k, v in vars(sums).items()})
+    evidence = shared_evidence("alpha", gaussians, none, T_map_keyframe, kind=kind)
+    assert evidence.information.any() == (kind == "uniform")
