@@ -1,4 +1,4 @@
-"""Names of array types that many modules use, and the rows that an index means."""
+"""Names of array types that many modules use, the rows that an index means, and those that are not finite."""
 
 from __future__ import annotations
 
@@ -19,3 +19,13 @@ def rows_of(index: ArrayLike) -> NDArray[np.int64]:
     """
     rows = np.asarray(index)
     return np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+
+
+def rows_not_finite(values: ArrayLike) -> NDArray[np.int64]:
+    """Rows that have a number that is not finite, ascending.
+
+    Args:
+        values: [n, ...], any unit.
+    """
+    finite = np.isfinite(values)
+    return np.flatnonzero(~finite.all(axis=tuple(range(1, finite.ndim))))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.arrays import Array, rows_not_finite
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file, read_text
 from duagc.pipeline.geometry import se3, so3
@@ -42,7 +42,10 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     Args:
         path: file to write; it appears when it is complete.
         trajectory: T_reference_body over time, meters.
+    Raises:
+        ValueError: a pose is not finite.
     """
+    _check_finite("trajectory.poses", trajectory.poses)
     quats = so3.to_quat_wxyz(trajectory.poses[:, :3, :3])
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for stamp, t, q in zip(trajectory.stamps_ns.tolist(), trajectory.positions, quats, strict=True):
@@ -121,8 +124,11 @@ def align(points_a: ArrayLike, points_b: ArrayLike) -> Array:
 
     Raises:
         DuagError: fewer than three pairs, or points on one line: the rotation is not determined.
+        ValueError: a position is not finite.
     """
     a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
+    _check_finite("points_a", a)
+    _check_finite("points_b", b)
     if len(a) < 3:
         raise DuagError(f"alignment needs at least 3 paired positions, found {len(a)}")
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
@@ -140,10 +146,24 @@ def ate_rmse_m(positions_true: ArrayLike, positions_estimated: ArrayLike) -> flo
     Args:
         positions_true: [n, 3], meters.
         positions_estimated: [n, 3], meters, at the same times, in any frame.
+    Raises:
+        DuagError: the alignment is not determined.
+        ValueError: positions are not finite, not [n, 3], or not as many true ones as estimated ones.
     """
     true, estimated = np.asarray(positions_true), np.asarray(positions_estimated)
+    for name, points in (("positions_true", true), ("positions_estimated", estimated)):
+        if len(points) and points.shape != (len(true), 3):
+            raise ValueError(f"{name} has shape {points.shape}, expected {(len(true), 3)}")
+        _check_finite(name, points)
     T = align(true, estimated)
     return float(np.sqrt(np.mean(np.sum((true - se3.transform(T, estimated)) ** 2, axis=1))))
+
+
+def _check_finite(name: str, rows: Array) -> None:
+    """Refuse poses or positions [n, ...] of which some are not finite."""
+    bad = rows_not_finite(rows)
+    if len(bad):
+        raise ValueError(f"{name}: {len(bad)} of {len(rows)} are not finite, the first is {bad[0]}")
 
 
 def rpe_rmse(poses_true: ArrayLike, poses_estimated: ArrayLike, step: int = 1) -> tuple[float, float]:

@@ -91,3 +91,26 @@ def test_ate_of_public_trajectories(truth: str, estimate: str, expected_m: float
     assert trajectory.ate_rmse_m(true.positions[i], estimated.positions[j]) == pytest.approx(
         expected_m, abs=2e-6
     )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_errors_name_the_positions_that_are_not_finite(value: float, tmp_path: Path) -> None:
+    truth, broken = walk().positions, walk().poses
+    broken[[7, 9], 1, 3] = value
+    with pytest.raises(ValueError, match="positions_estimated: 2 of 40 are not finite, the first is 7"):
+        trajectory.ate_rmse_m(truth, broken[:, :3, 3])
+    with pytest.raises(ValueError, match="positions_true: 2 of 40"):
+        trajectory.ate_rmse_m(broken[:, :3, 3], truth)
+    with pytest.raises(ValueError, match="points_b: 2 of 40"):
+        trajectory.align(truth, broken[:, :3, 3])
+    with pytest.raises(ValueError, match=r"trajectory\.poses: 2 of 40"):
+        trajectory.write_tum(tmp_path / "t.tum", Trajectory(walk().stamps_ns, broken))
+    assert not list(tmp_path.iterdir())
+
+
+def test_errors_name_the_shape_of_what_are_no_paired_positions() -> None:
+    truth = walk().positions
+    with pytest.raises(ValueError, match=r"positions_estimated has shape \(20, 3\), expected \(40, 3\)"):
+        trajectory.ate_rmse_m(truth, truth[:20])
+    with pytest.raises(ValueError, match=r"positions_true has shape \(40, 4, 4\), expected \(40, 3\)"):
+        trajectory.ate_rmse_m(walk().poses, truth)
