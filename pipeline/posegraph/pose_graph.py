@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.arrays import Array, rows_not_finite
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.relative_poses import (
@@ -53,8 +54,14 @@ def solve_pose_graph(
         tolerance: on the largest component of a step (m, rad).
     Returns:
         The poses, and whether they converged; the cost is that of `least_squares`.
+    Raises:
+        DuagError: a number is not finite, or the graph cannot be solved for.
     """
     w = np.broadcast_to(np.asarray(weights, dtype=np.float64), (len(relative_poses),))
+    measured = {"relative pose": relative_poses.T_i_j, "information": relative_poses.information}
+    for name, numbers in ({"start": T_start, "weight": w} | measured).items():
+        if len(bad := rows_not_finite(numbers)):
+            raise DuagError(f"pose graph: {name} {bad[0]} is not finite, expected finite numbers")
     T, damping, converged, step = np.array(T_start, dtype=np.float64), 0.0, False, 0
     value = least_squares.cost(relative_poses, T, w)
     while step < iterations and not converged and len(relative_poses):

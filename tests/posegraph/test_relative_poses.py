@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.posegraph import least_squares
@@ -118,3 +119,15 @@ def test_central_solution_stands_still_where_every_gradient_vanishes():
     assert solution.cost < 1e-15
     g, _ = least_squares.gradient(consistent, np.ones(len(consistent)), solution.poses)
     assert np.abs(g).max() < 1e-6
+
+
+def test_central_solution_names_the_number_that_is_not_finite():
+    factors, poses = scattered(10)
+    broken, measured, weights = poses.copy(), factors.T_i_j.copy(), np.ones(len(factors))
+    broken[2, 0, 3] = measured[3, 1, 3] = weights[4] = np.nan
+    with pytest.raises(DuagError, match="start 2 is not finite"):
+        solve_pose_graph(factors, broken)
+    with pytest.raises(DuagError, match="relative pose 3 is not finite"):
+        solve_pose_graph(RelativePoses(factors.i, factors.j, measured, factors.information), poses)
+    with pytest.raises(DuagError, match="weight 4 is not finite"):
+        solve_pose_graph(factors, poses, weights)
