@@ -83,8 +83,9 @@ def place(pairs: Mapping[Pair, Sequence[Proposal]], robots: Sequence[str], margi
         robots: all names.
         margin: factor on variances; infinite if cycles decide nothing.
     """
-    detours = _all_detours(pairs, margin)
-    scores = {pair: _scores(pairs[pair], detours[pair], margin) for pair in pairs}
+    # with an infinite margin every cycle closes, which is no evidence
+    detours = {} if math.isinf(margin) else _all_detours(pairs, margin)
+    scores = {pair: _scores(proposals, detours.get(pair)) for pair, proposals in pairs.items()}
     best = {pair: int(np.argmax(score)) for pair, score in scores.items()}  # the first of equals
     cycles = _cycles(detours)
     support = {pair: float(scores[pair][k]) for pair, k in best.items()} | _refuted(cycles)
@@ -156,10 +157,10 @@ def _all_detours(pairs: Mapping[Pair, Sequence[Proposal]], margin: float) -> dic
     return out
 
 
-def _scores(proposals: Sequence[Proposal], detours: _Detours, margin: float) -> Array:
+def _scores(proposals: Sequence[Proposal], detours: _Detours | None) -> Array:
     """Weight of every proposal [k] of a pair and what cycles of three robots add."""
     own = np.array([p.weight for p in proposals])
-    if math.isinf(margin) or not detours.first:  # every cycle closes, which is no evidence
+    if detours is None or not detours.first:
         return own
     confirmed = np.where(detours.confirms, detours.weight[:, None], 0.0)
     added = np.maximum.reduceat(confirmed, list(detours.first.values()), axis=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -40,14 +41,20 @@ def spanning_tree(pairs: Mapping[tuple[str, str], float], robots: Sequence[str])
         robots: all names; the lowest of a component is its root.
     """
     support = {**{(b, a): value for (a, b), value in pairs.items()}, **pairs}
+    edges: dict[str, list[tuple[float, tuple[str, str]]]] = {robot: [] for robot in robots}
+    for (a, b), value in support.items():
+        edges[a].append((-value, (a, b)))
     parent: dict[str, str | None] = {}
     for root in sorted(robots):
         if root in parent:
             continue
         parent[root] = None
-        component = {root}
-        while border := [(-support[e], e) for e in support if e[0] in component and e[1] not in component]:
-            a, b = min(border)[1]
-            parent[b] = a
-            component.add(b)
+        border = list(edges[root])
+        heapq.heapify(border)
+        while border:
+            a, b = heapq.heappop(border)[1]
+            if b not in parent:
+                parent[b] = a
+                for edge in edges[b]:
+                    heapq.heappush(border, edge)
     return parent

@@ -9,6 +9,7 @@ import pytest
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph import cycle_consistency
 from duagc.pipeline.posegraph.cycle_consistency import Proposal, place
+from duagc.pipeline.posegraph.spanning_tree import spanning_tree
 from tests.fixtures.pose_worlds import random_poses
 
 NAMES = ["alpha", "bravo", "charlie", "delta"]
@@ -166,7 +167,7 @@ def test_all_detours_at_once_are_those_one_by_one():
                 scores += confirmed
                 if a < c < b:
                     cycles[a, c, b] = bool(confirmed.any())
-        assert cycle_consistency._scores(proposals, detours[a, b], 1.0).tolist() == scores.tolist()
+        assert cycle_consistency._scores(proposals, detours[a, b]).tolist() == scores.tolist()
     found = {(a, b, c): closed for ((a, b), (_, c), _), closed in cycle_consistency._cycles(detours).items()}
     assert found == cycles
     assert 0 < sum(cycles.values()) < len(cycles) == 16
@@ -178,3 +179,19 @@ def test_a_team_of_two_dozen_robots_that_all_met_is_placed_in_little_time():
     found = place(pairs, list(T), 4.0)
     assert time.process_time() - began < 1.5  # cycle by cycle it is 3 s
     assert len(found.T_world_map) == 24
+
+
+def test_the_tree_grows_along_the_best_supported_link_of_its_border():
+    rng = np.random.default_rng(9)
+    for _ in range(200):
+        robots = [f"r{k}" for k in rng.permutation(int(rng.integers(1, 9)))]
+        links = [link for link in itertools.combinations(robots, 2) if rng.random() < 0.5]
+        support = {link: float(rng.integers(4)) for link in links}
+        parent = spanning_tree(support, robots)
+        joined = set()
+        for robot, nearer in parent.items():
+            ends = [(e, n) for link, n in support.items() for e in (link, link[::-1])]
+            border = [(-n, (a, b)) for (a, b), n in ends if a in joined and b not in joined]
+            expected = min(border)[1] if border else (None, min(set(robots) - joined))
+            assert (nearer, robot) == expected
+            joined.add(robot)

@@ -195,7 +195,7 @@ def test_agreement_in_blocks_of_rows_is_that_of_all_pairs_at_once(m):
 
 
 def test_pairwise_consistency_keeps_no_matrix_of_numbers():
-    m = 1200
+    m = 800
     closures, own, peer, grown, truth, _ = pair(9, good=m - 200, bad=200)
     tracemalloc.start()
     found = agreeing(closures, own, peer, grown)
