@@ -150,7 +150,8 @@ class Agent:
         if self.agreed:
             self.sharing.match(self.others)
         self._finish()
-        return [packet for neighbor in self.radio.in_contact for packet in self._burst(neighbor)]
+        state = self._state()
+        return [packet for neighbor in self.radio.in_contact for packet in self._burst(neighbor, state)]
 
     @property
     def others(self) -> list[int]:
@@ -226,27 +227,28 @@ class Agent:
 
     # --- outgoing
 
-    def _burst(self, neighbor: Neighbor) -> list[Outgoing]:
+    def _burst(self, neighbor: Neighbor, state: bytes) -> list[Outgoing]:
         finished = self.done and neighbor.state is not None and neighbor.state.done
-        states = [] if finished else self._states(neighbor)
+        states = [] if finished else self._states(neighbor, state)
         return neighbor.transport.burst(self.round, states, self.config.link.budget_bytes)
 
-    def _states(self, neighbor: Neighbor) -> list[Message]:
-        """The state of this round, with the poses of this round if there are any."""
+    def _state(self) -> bytes:
+        """The state of this round, the same for every neighbor."""
         direct = {n.index for n in self.radio.joined}
         senders = {n.index for n in self.neighbors.values() if n.may_send_evidence}
-        state = state_wire.write_state(
-            State(
-                links=self.alignment.links,
-                revoked_links=self.alignment.revoked,
-                alignment_hops=self.alignment_hops,
-                converged_hops=self.converged_hops,
-                agreed=self.agreed,
-                done=self.done,
-                sources=self.sharing.knowledge.sources(direct, senders),
-            ),
-            short=not self.sharing.enabled,
+        state = State(
+            links=self.alignment.links,
+            revoked_links=self.alignment.revoked,
+            alignment_hops=self.alignment_hops,
+            converged_hops=self.converged_hops,
+            agreed=self.agreed,
+            done=self.done,
+            sources=self.sharing.knowledge.sources(direct, senders),
         )
+        return state_wire.write_state(state, short=not self.sharing.enabled)
+
+    def _states(self, neighbor: Neighbor, state: bytes) -> list[Message]:
+        """The state of this round, with the poses of this round if there are any."""
         payloads = [state]
         missing = injection.poses_are_missing(
             self.config.injection,
@@ -257,8 +259,7 @@ class Agent:
         )
         sends_poses = neighbor.index in self.links and not missing and not self._all_agreed()
         if self.poses is not None and sends_poses:
-            room_bytes = MAX_PAYLOAD_BYTES - len(state)
-            parts = self.poses.states(self.links[neighbor.index], room_bytes)
+            parts = self.poses.states(self.links[neighbor.index], MAX_PAYLOAD_BYTES - len(state))
             payloads = [state + part for part in parts] or payloads
         # with evidence to share, states go out in every round
         if payloads == [state] and not self.sharing.enabled and neighbor.was_sent(state, self.round):

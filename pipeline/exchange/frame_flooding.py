@@ -30,12 +30,14 @@ class FrameFlooding:
         Raises:
             MalformedError: it is not what it should be, or decides on a pair of this robot.
         """
-        held = {
-            self.pair_with(n)
-            for n in self._radio.neighbors.values()
-            if n.loop_closing is None or n.loop_closing.decides
-        }
-        n.passed.frames.setdefault(self._alignment.receive(payload, held), 0)
+        n.passed.frames.setdefault(self._alignment.receive(payload, self._decides), 0)
+
+    def _decides(self, pair: Pair) -> bool:
+        """Whether this robot decides on a pair, or may still."""
+        if self._radio.own not in pair:
+            return False
+        n = self._radio.neighbors.get(sum(pair) - self._radio.own)
+        return n is not None and (n.loop_closing is None or n.loop_closing.decides)
 
     def pair_with(self, n: Neighbor) -> Pair:
         """This robot and a neighbor.
@@ -50,12 +52,12 @@ class FrameFlooding:
         joined = self._radio.joined
         for n in joined:
             self._add_decision(n)
+        known = self._alignment.payloads
         for n in joined:
-            for pair in sorted(self._alignment.payloads):
-                if pair not in n.passed.frames:
-                    payload = self._alignment.payloads[pair]
-                    n.passed.frames[pair] = self._radio.send(n, Kind.RELATIVE_FRAME, payload)
-        return not any(n.transport.is_open(m) for n in joined for m in n.passed.frames.values())
+            for pair in sorted(known.keys() - n.passed.frames.keys()):
+                n.passed.frames[pair] = self._radio.send(n, Kind.RELATIVE_FRAME, known[pair])
+        busy = (n for n in joined if not n.transport.idle)
+        return not any(n.transport.is_open(m) for n in busy for m in n.passed.frames.values())
 
     def _add_decision(self, n: Neighbor) -> None:
         """Add the relative frame of the pair with a joined neighbor, if this end has decided on it."""

@@ -7,7 +7,7 @@ proposal for each group of loop closures that agrees. Agents that know the same 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.tree import TreePlace
@@ -34,47 +34,44 @@ class MapAlignment:
         self.own, self.team, self.margin, self.short = own, list(team), margin, short
         self.pairs: dict[Pair, RelativeFrames] = {}
         self.payloads: dict[Pair, bytes] = {}
-        self.revoked = 0  # links known to have been revoked, a mask of pair_bit
+        self.links = 0  # all pairs known, revoked ones too, a mask of pair_bit
+        self.revoked = 0  # links known to have been revoked, likewise
+        self._pair_of: dict[bytes, Pair] = {}  # by payload
         self._placement: Placement | None = None
 
-    def receive(self, payload: bytes, held: set[Pair]) -> Pair:
+    def receive(self, payload: bytes, held: Callable[[Pair], bool]) -> Pair:
         """Use what a neighbor sent of a pair, if it is new; returns the pair.
 
         Args:
             payload: of the message.
-            held: pairs that this robot decides on.
+            held: whether this robot decides on a pair.
         Raises:
             MalformedError: it is not what it should be, or decides on a pair of this robot.
         """
+        if payload in self._pair_of:  # most of what is flooded comes from several neighbors
+            return self._pair_of[payload]
         frames = state_wire.read_relative_frames(payload, len(self.team))
         pair = (frames.lower, frames.higher)
-        if pair in held and pair not in self.pairs:
-            raise MalformedError("frame: a neighbor speaks for this robot")
         if pair not in self.pairs:
-            self.pairs[pair], self.payloads[pair] = frames, payload
-            self._placement = None
+            if held(pair):
+                raise MalformedError("frame: a neighbor speaks for this robot")
+            self._know(pair, frames, payload)
         return pair
 
     def add(self, frames: RelativeFrames) -> None:
         """Add what this robot itself decided, as all others will read it."""
-        pair, payload = (
-            (frames.lower, frames.higher),
-            state_wire.write_relative_frames(frames, short=self.short),
-        )
-        self.pairs[pair], self.payloads[pair] = (
-            state_wire.read_relative_frames(payload, len(self.team)),
-            payload,
-        )
+        payload = state_wire.write_relative_frames(frames, short=self.short)
+        read = state_wire.read_relative_frames(payload, len(self.team))
+        self._know((frames.lower, frames.higher), read, payload)
+
+    def _know(self, pair: Pair, frames: RelativeFrames, payload: bytes) -> None:
+        self.pairs[pair], self.payloads[pair], self._pair_of[payload] = frames, payload, pair
+        self.links |= pair_bit(*pair)
         self._placement = None
 
     def revoke(self, known: int) -> None:
         """Revoke these links, a mask of `pair_bit`: they do not count any more."""
         self.revoked, self._placement = known, None
-
-    @property
-    def links(self) -> int:
-        """All pairs known, revoked ones too, as a mask."""
-        return sum(pair_bit(*pair) for pair in self.pairs)
 
     def _alive(self) -> list[Pair]:
         return [pair for pair in sorted(self.pairs) if not self.revoked & pair_bit(*pair)]
