@@ -111,9 +111,10 @@ class Front:
         shape = (6 * self.size, 6 * self.size)
         H = sparse.coo_matrix((np.concatenate(values), index), shape=shape).tocsc()
         e = 6 * self.eliminated
-        across, kept = H[:e, e:].toarray(), H[e:, e:].toarray()
+        across, kept = H[:e, e:], H[e:, e:].toarray()
         self._solve = least_squares.factorized(H[:e, :e].tocsc()) if e else None
-        self._coupling = self._solve(across) if self._solve is not None and across.size else across
+        right = across.toarray()
+        self._coupling = self._solve(right) if self._solve is not None and right.size else right
         S = kept - across.T @ self._coupling
         return 0.5 * (S + S.T)
 
