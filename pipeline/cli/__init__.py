@@ -6,7 +6,7 @@ from io import TextIOWrapper
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.stop_signals import stop_by_ending
+from duagc.pipeline.base.stop_signals import ending_as_interrupts
 from duagc.pipeline.cli.common import EXIT_FAILED, app
 
 # each registers its commands, and `--help` lists them in this order
@@ -51,12 +51,12 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's shar
 def main() -> None:
     """Entry point: one line and exit code 1 for whatever a user can fix."""
     determinism.configure_determinism()
-    stop_by_ending()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")  # a terminal may lack a letter of a name
     try:
-        app()
+        with ending_as_interrupts():
+            app()
     except DuagError as error:
         print(f"duagc: {error}", file=sys.stderr)
         sys.exit(EXIT_FAILED)

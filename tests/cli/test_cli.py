@@ -157,8 +157,9 @@ def test_an_output_that_appeared_meanwhile_is_kept(tmp_path: Path) -> None:
 
 
 def _listen_to_interrupts() -> None:
-    """What a shell starts in the background, tests among it, is deaf to them."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """What a shell starts in the background, or nohup, is deaf to some; tests among it."""
+    for stop in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(stop, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize(
@@ -239,3 +240,13 @@ def test_a_user_finds_why_a_loop_closure_was_rejected(tmp_path: Path) -> None:
     assert listed["verdicts"] == {"outvoted": 1, "kept": 1, "inconsistent": 1, "few_matches": 1}
     assert listed["candidates"][1]["weight"] == 1.0
     assert_one_line(duagc_here("inspect", fake.run, "--loop-closures", "--robot", "zulu"), "no robot 'zulu'")
+
+
+def test_a_command_leaves_the_signals_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program may call it, as tests do."""
+    before = [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGHUP)]
+    monkeypatch.setattr(sys, "argv", ["duagc", "--version"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 0
+    assert [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGHUP)] == before
