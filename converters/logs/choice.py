@@ -72,7 +72,14 @@ class Chooser:
             wanted: topics by name of the option ("color", ...), "" = not given.
         """
         self.log, self.namespace, self._wanted = log, namespace.rstrip("/"), dict(wanted or {})
-        self.images: dict[str, Any] = {t: first_usable(log, t) for t in image_topics(log, self.namespace)}
+        self.images: dict[str, Any] = {
+            t: first_usable(log, t) for t in log.of_type(*IMAGE_TYPES, below=self.namespace)
+        }
+        self.unread = ""  # what to add to a complaint that there are no images: why video has none
+        films = sorted(t.name for t in log.topics.values() if is_video(t.type) and t.count)
+        for topic in films:
+            if is_below(topic, self.namespace):
+                self._add_video(topic)
         self.infos = log.of_type(INFO_TYPE, below=self.namespace)
         self.clouds = log.of_type(POINTS_TYPE, below=self.namespace)
 
@@ -80,7 +87,8 @@ class Chooser:
         """Images that are not depth, and are not named so."""
         found = [t for t, m in self.images.items() if not is_depth(m) and not self._is_named_depth(t)]
         left = LEFT if self._wanted.get("depth_from") == "stereo" else ()
-        return self._one("color", self._without_video(found), (*left, "color", "rgb"))
+        choice = self._one("color", self._without_video(found), (*left, "color", "rgb"))
+        return choice if choice.topic else replace(choice, why=choice.why + self.unread)
 
     def depth(self) -> Choice:
         """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does.
@@ -130,6 +138,13 @@ class Chooser:
                 return Choice("", f"{image_topic} has CameraInfo on no topic", expected=stated)
             return Choice("", f"{image_topic} has CameraInfo on {', '.join(self.infos)}", tuple(self.infos))
         return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
+
+    def _add_video(self, topic: str) -> None:
+        """The images of video, if its messages can be read: bags may lack their definition."""
+        try:
+            self.images[topic] = first_usable(self.log, topic)
+        except DuagError as error:
+            self.unread += f"; {error}"
 
     def _without_video(self, topics: Sequence[str]) -> Sequence[str]:
         """Topics of images, if there are any: video often repeats them, with losses."""
@@ -193,17 +208,6 @@ def _has(topic: str, hint: str) -> bool:
     if hint not in REGISTERED:
         return hint in topic.lower()
     return re.search(rf"(?<![a-z0-9]){hint}(?![a-z0-9])", topic.lower()) is not None
-
-
-def image_topics(log: Log, namespace: str = "") -> list[str]:
-    """Names of topics of images or video that have messages.
-
-    Args:
-        log: the log.
-        namespace: only topics below it.
-    """
-    kinds = {topic.type for topic in log.topics.values()}
-    return log.of_type(*IMAGE_TYPES, *filter(is_video, kinds), below=namespace)
 
 
 def first_usable(log: Log, topic: str) -> Any:

@@ -70,7 +70,9 @@ class RobotLog:
         chooser = Chooser(self.log, self.namespace, s.model_dump())
         if not chooser.images:
             where = f" below {self.namespace}" if self.namespace else ""
-            raise DuagError(f"{self.name}: found no topic of images{where}, expected color and depth")
+            raise DuagError(
+                f"{self.name}: found no topic of images{where}, expected color and depth{chooser.unread}"
+            )
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.settings = s = as_stated(self.log, self.depth, s, own=self._own)

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from duagc.converters import registry
@@ -21,7 +22,7 @@ from duagc.converters.logs.video import images
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import open_rgbd
 from tests.fixtures import h265_packets
-from tests.fixtures.foreign_mcap import Row, write
+from tests.fixtures.foreign_mcap import Row, encoded, write
 from tests.fixtures.ros_bags import Ros, scene
 from tests.fixtures.video_packets import Planes, packets, planes_of, shown
 
@@ -228,3 +229,26 @@ def test_images_count_before_video_of_them(tmp_path: Path) -> None:
     registry.convert("ros", log, tmp_path / "rec")
     with open_log([log]) as opened:
         assert opened.topics["/camera/color/video"].count == 3
+
+
+@pytest.mark.parametrize("left", ["nothing", "depth", "all"])
+def test_video_whose_messages_cannot_be_read_is_named_where_images_lack(tmp_path: Path, left: str) -> None:
+    """What nobody can read does not stand in the way of images that can be."""
+    r = Ros(2)
+    path = tmp_path / "log.mcap"
+    rows = [] if left == "nothing" else [row for row in scene(r) if left == "all" or row[0] != COLOR]
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("foxglove.CompressedVideo", "protobuf", b"")
+        writer.add_message(writer.register_channel("/cam/video", "protobuf", schema), 1, b"x", 1)
+        for topic, log_ns, message in rows:
+            name, encoding, text, data = encoded(message, "cdr", r)
+            number = writer.register_channel(topic, "cdr", writer.register_schema(name, encoding, text))
+            writer.add_message(number, log_ns, data, log_ns)
+        writer.finish()
+    if left == "all":
+        registry.convert("ros", path, tmp_path / "rec")
+        return
+    with pytest.raises(DuagError, match=r"/cam/video holds 1 bytes that are no foxglove.CompressedVideo"):
+        registry.convert("ros", path, tmp_path / "rec")
