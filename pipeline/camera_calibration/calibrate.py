@@ -8,16 +8,19 @@ the views that of both. Frames that are held out for the evaluation of maps take
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.base.workers import worker_pool
@@ -30,6 +33,8 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.recording import Recording
 
 Found = TypeVar("Found")
+Pool = ProcessPoolExecutor | None
+"""Where tasks are done; None: in this process."""
 Part = tuple[Tracked, int, int]
 """A log, and its frames from one to before another."""
 MIN_LANDMARKS = 200  # of a half
@@ -130,17 +135,40 @@ def calibrate(
         config: of the front end that tracks it.
         robots: names; empty = all.
         views: largest number of each half.
-        workers: robots that are tracked at the same time; changes no bit of the result.
+        workers: tasks that are done at the same time; changes no bit of the result.
 
     Raises:
         UndeterminedError: its images do not determine the cameras.
         DuagError: the recording is broken, or the robots have different cameras.
     """
+    with _pool(workers) as pool:
+        return _calibration(folder, config, robots, views, pool)
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[Pool]:
+    if workers < 2:
+        yield None
+    else:
+        with worker_pool(workers, determinism.configure_opencv) as pool:
+            yield pool
+
+
+def _later(pool: Pool, task: Callable[..., Found], *arguments: Any, **named: Any) -> Callable[[], Found]:
+    """Gives what a task finds: of this process, when it is asked for first."""
+    if pool is None:
+        return cache(partial(task, *arguments, **named))
+    return pool.submit(task, *arguments, **named).result
+
+
+def _calibration(
+    folder: Path, config: FrontendConfig, robots: Sequence[str], views: int, pool: Pool
+) -> Calibration:
     source = Recording(folder)
     for robot in robots:
         if robot not in source.robots:
             raise DuagError(f"{folder}: has no robot {robot}, expected one of {', '.join(source.robots)}")
-    tracked = _track({robot: source.log(robot) for robot in robots or source.robots}, config, workers)
+    tracked = _track({robot: source.log(robot) for robot in robots or source.robots}, config, pool)
     if len(tracked) == 1:
         n = len(tracked[0].ok)
         ranges: list[list[Part]] = [[(tracked[0], a, b)] for a, b in pairwise((0, n // 2, n))]
@@ -148,7 +176,8 @@ def calibrate(
     else:
         ranges = [[(t, 0, len(t.ok)) for t in tracked[k::2]] for k in (0, 1)]
         most = max(12, 2 * views // len(tracked))
-    loaded = [_determined(partial(_loaded, part, most) for part in half) for half in ranges]
+    loading = [[_later(pool, _loaded, part, most) for part in half] for half in ranges]
+    loaded = [_determined(half) for half in loading]
     # a robot whose images show nothing to follow says nothing of the cameras
     kept = [[(part, seen) for part, seen in half if len(seen.points_map)] for half in loaded]
     halves = [[seen for _, seen in half] for half in kept]
@@ -162,24 +191,14 @@ def calibrate(
             raise UndeterminedError(
                 f"{folder}: {found} features were followed in {names}, expected {MIN_LANDMARKS}"
             )
-    between = [
-        views_between
-        for half in kept
-        for of, part in half
-        if (views_between := _between(of, part, most)) is not None
-    ]
-    return _calibrate(folder, halves, between, source.description)
+    loading_between = [_later(pool, _between, of, part.frames, most) for half in kept for of, part in half]
+    between = [found_between for load in loading_between if (found_between := load()) is not None]
+    return _calibrate(folder, halves, between, source.description, pool)
 
 
-def _track(logs: dict[str, Path], config: FrontendConfig, workers: int) -> list[Tracked]:
+def _track(logs: dict[str, Path], config: FrontendConfig, pool: Pool) -> list[Tracked]:
     """The robots that have frames enough; all that were tracked, if none has."""
-    with ExitStack() as stack:
-        if min(workers, len(logs)) < 2:
-            found = _determined(partial(track_log, log, robot, config) for robot, log in logs.items())
-        else:
-            pool = stack.enter_context(worker_pool(min(workers, len(logs))))
-            tasks = [pool.submit(track_log, log, robot, config) for robot, log in logs.items()]
-            found = _determined(task.result for task in tasks)
+    found = _determined([_later(pool, track_log, log, robot, config) for robot, log in logs.items()])
     return [t for t in found if np.count_nonzero(t.ok & ~t.held_out) >= MIN_VIEWS] or found
 
 
@@ -204,21 +223,21 @@ def _determined(tasks: Iterable[Callable[[], Found]]) -> list[Found]:
     return found
 
 
-def _between(of: Part, used: Views, most: int) -> Views | None:
-    """Views of frames between those of a part; None if there are too few."""
+def _between(of: Part, used: NDArray[np.int64], most: int) -> Views | None:
+    """Views of frames of a part between those that are used; None if there are too few."""
     try:
-        found = load_views(*of, most // 2, without=used.frames.tolist())
+        found = load_views(*of, most // 2, without=used.tolist())
     except UndeterminedError:
         return None
     return found if len(found.points_map) >= MIN_LANDMARKS // 2 else None
 
 
 def _calibrate(
-    folder: Path, halves: list[list[Views]], between: list[Views], description: dict[str, Any]
+    folder: Path, halves: list[list[Views]], between: list[Views], description: dict[str, Any], pool: Pool
 ) -> Calibration:
     start = CameraRig.of(halves[0][0].camera)
-    done = list(track(_adjustments(halves, between, start), "adjust", total=9 if between else 7))
-    recorded, alone, by_other, both = done[:2], done[2:4], done[4:6], done[6]
+    done = list(track(_adjustments(halves, between, start, pool), "adjust", total=9 if between else 7))
+    alone, both, recorded, by_other = done[:2], done[2], done[3:5], done[5:7]
     assert both.covariance is not None
     sigma = dict(zip(NAMES, np.sqrt(np.diag(both.covariance)).tolist(), strict=True))
     scale = start.camera.width / 640
@@ -254,28 +273,30 @@ def _calibrate(
     )
 
 
-def _adjustments(halves: list[list[Views]], between: list[Views], start: CameraRig) -> Iterator[Adjusted]:
-    """Each half as recorded, each calibrated by itself, each as the other calibrates it, and all of it calibrated.
+def _adjustments(
+    halves: list[list[Views]], between: list[Views], start: CameraRig, pool: Pool
+) -> Iterator[Adjusted]:
+    """Each half calibrated by itself, all of it calibrated, each half as recorded and as the other calibrates it.
 
     Then the views between, as recorded and as all of it is calibrated.
     """
+    alone = [_later(pool, _adjusted, half, start, True) for half in halves]
+    both = _later(pool, _adjusted, [part for half in halves for part in half], start, True)
+    recorded = [_later(pool, _adjusted, part, start, False) for part in (*halves, between) if part]
+    for task in alone:
+        yield task()
+    by_other = [
+        _later(pool, _adjusted, half, other().rig, False)
+        for half, other in zip(halves, reversed(alone), strict=True)
+    ]
+    yield both()
+    by_both = [_later(pool, _adjusted, part, both().rig, False) for part in (between,) if part]
+    for task in (*recorded[:2], *by_other, *recorded[2:], *by_both):
+        yield task()
 
-    def adjusted(parts: Sequence[Views], rig: CameraRig, calibrate: bool) -> Adjusted:
-        return adjust([copy(part) for part in parts], rig, calibrate)
 
-    for half in halves:
-        yield adjusted(half, start, False)
-    alone = []
-    for half in halves:
-        alone.append(adjusted(half, start, True))
-        yield alone[-1]
-    for half, other in zip(halves, reversed(alone), strict=True):
-        yield adjusted(half, other.rig, False)
-    both = adjusted([part for half in halves for part in half], start, True)
-    yield both
-    if between:
-        yield adjusted(between, start, False)
-        yield adjusted(between, both.rig, False)
+def _adjusted(parts: Sequence[Views], rig: CameraRig, calibrate: bool) -> Adjusted:
+    return adjust([copy(part) for part in parts], rig, calibrate)
 
 
 def _mean(quality: Sequence[Quality]) -> Quality:

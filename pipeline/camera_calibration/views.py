@@ -113,7 +113,8 @@ def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
     """
     failure = config.tracking.failure.model_copy(update={"color_check_gray_of_usual": math.inf})
     tracking = config.tracking.model_copy(update={"failure": failure})
-    config = config.model_copy(update={"mapping_enabled": False, "tracking": tracking})
+    exposure = config.exposure.model_copy(update={"mode": "off"})  # only maps need it
+    config = config.model_copy(update={"mapping_enabled": False, "tracking": tracking, "exposure": exposure})
     with tempfile.TemporaryDirectory(prefix="duagc-calibrate-") as folder:
         try:
             run_frontend(path, Path(folder) / "frontend.mcap", config, progress=True)

@@ -150,7 +150,7 @@ def _convert_calibrated(convert_to: Callable[[Path, bool], None], out: Path, for
     with new_folder(out, force, RECORDING) as folder:
         plain = folder / "plain" / out.resolve().name  # a recording has the name of its folder
         convert_to(plain, False)
-        outcomes, written = calibrated(Recording(plain), lambda: folder, plain.name, RunConfig())
+        outcomes, written = calibrated(Recording(plain), lambda: folder, plain.name, RunConfig(), workers=2)
         for outcome in outcomes:
             for line in outcome.lines():
                 say(line)

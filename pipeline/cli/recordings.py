@@ -16,7 +16,6 @@ from duagc.pipeline.cli.common import (
     Json,
     Overrides,
     StoreFolder,
-    Workers,
     app,
     say,
 )
@@ -123,7 +122,7 @@ def calibrate(
         Path | None,
         typer.Option(metavar="REC", help="Recording to write: this one with the cameras that were found."),
     ] = None,
-    workers: Workers = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Tasks done at the same time; changes no result.")] = 2,
     force: Force = False,
     config: ConfigFile = None,
     overrides: Overrides = None,

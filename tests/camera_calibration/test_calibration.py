@@ -203,7 +203,7 @@ def test_a_robot_whose_images_show_nothing_to_follow_is_left_out(monkeypatch: py
 
     source = SimpleNamespace(robots=list(seen), log=Path, description={})
     monkeypatch.setattr(calibration, "Recording", lambda folder: source)
-    monkeypatch.setattr(calibration, "_track", lambda logs, config, workers: tracked)
+    monkeypatch.setattr(calibration, "_track", lambda logs, config, pool: tracked)
     monkeypatch.setattr(calibration, "load_views", loaded)
     found = calibrate(Path("team"), FrontendConfig(), [])
     assert found.names == ["room 0", "room 1"]
