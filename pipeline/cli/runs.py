@@ -161,6 +161,8 @@ def run(
     )
     _say_times(out)
     _print_outputs(out)
+    if not calibrate:
+        _say_advice(out, recording)
 
 
 @app.command()
@@ -214,6 +216,16 @@ def _say_times(run_folder: Path) -> None:
         wall, cpu, peak = row["wall_s"], row["cpu_s"], row["peak_rss_mb"]
         stored = "" if row["executed"] else "   from the store"
         say(f"{name:<24}{wall:>8.1f} s {cpu:>8.1f} s of processor {peak:>6.0f} MB{stored}")
+
+
+def _say_advice(run_folder: Path, recording: Path) -> None:
+    from duagc.pipeline.recording import Recording
+    from duagc.pipeline.report.advice import calibration_advice
+    from duagc.pipeline.runs.folder import RunFolder
+
+    run = RunFolder(run_folder)
+    if run.metrics and (advice := calibration_advice(run, Recording(recording))):
+        say(advice)
 
 
 def _print_outputs(run_folder: Path) -> None:

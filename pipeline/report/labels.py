@@ -77,6 +77,8 @@ ROBOT = {
     "ate_rmse_m_before_consensus": ("ATE before", "position error of the front end alone, own alignment, all frames"),
     "ate_rmse_m": ("ATE after", "position error after consensus, own alignment, all frames"),
     "ate_rmse_m_joint": ("ATE, joint", "position error after consensus under the alignment that the whole team shares"),
+    "feature_agreement_px": ("Features", "matched features of held-out views apart, median; no ground truth enters"),
+    "feature_agreement_px_of_truth": ("Features, truth", "the same under the poses of the ground truth"),
     "rpe_trans_m": ("RPE, position", "error of the motion from one frame to the next"),
     "rpe_rot_rad": ("RPE, rotation", "error of the turn from one frame to the next"),
 }  # fmt: skip

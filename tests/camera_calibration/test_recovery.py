@@ -107,6 +107,7 @@ def test_cameras_that_were_put_wrong_are_found_and_put_right(tmp_path: Path) -> 
         said = command(
             "calibrate", tmp_path / "raw", "--views", 36, "--out", file, "--apply", applied, "--json"
         )
+        assert command("calibrate", tmp_path / "raw", "--views", 36, "--workers", 1, "--json") == said
         found = json.loads(said)
         for name in NAMES:
             value, sigma = (found["values"][name][key] for key in ("value", "sigma"))

@@ -1,0 +1,54 @@
+"""A run of inexact cameras advises to calibrate them; one of exact cameras, or calibrated ones, does not."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from duagc.pipeline.report import advice
+from duagc.pipeline.report.advice import FEWEST_PAIRS, calibration_advice
+
+
+def run_of(calibration: tuple[str, ...] = (), pairs: int = 40, **off_px: float | None) -> Any:
+    robots = {
+        name: {"feature_agreement_px": off, "feature_agreement_pairs": pairs} for name, off in off_px.items()
+    }
+    return SimpleNamespace(metrics={"robots": robots}, calibration=list(calibration))
+
+
+@pytest.fixture
+def source(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setattr(advice, "_by_lidar", lambda source, name: name in source.lidar)
+    return SimpleNamespace(calibration=[], lidar=())
+
+
+def test_robots_whose_features_are_apart_are_named(source: Any) -> None:
+    said = calibration_advice(run_of(alpha=1.71, bravo=0.62, charlie=2.13), source)
+    assert "1.7 px (alpha), 2.1 px (charlie)" in said
+    assert "bravo" not in said
+    assert "--calibrate" in said
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        run_of(alpha=0.64),
+        run_of(alpha=None),
+        run_of(alpha=2.0, pairs=FEWEST_PAIRS - 1),
+        run_of(alpha=2.0, calibration=("alpha: kept as recorded",)),
+    ],
+    ids=["exact cameras", "no pairs", "few pairs", "was asked for"],
+)
+def test_nothing_is_advised(run: Any, source: Any) -> None:
+    assert calibration_advice(run, source) == ""
+
+
+def test_a_calibrated_recording_and_a_lidar_are_left_alone(source: Any) -> None:
+    run = run_of(alpha=2.0)
+    assert calibration_advice(run, source) != ""
+    source.lidar = ("alpha",)
+    assert calibration_advice(run, source) == ""
+    source.lidar, source.calibration = (), ["alpha: calibrated"]
+    assert calibration_advice(run, source) == ""
