@@ -175,28 +175,56 @@ def _planes(views: Views, pairs: NDArray[np.int64], rig: CameraRig) -> _Planes:
     rays = c.rays_at(column, row)
     z = rig.depth(views.inverse_depth[at].astype(np.float64), rays)
     p, normals = rays * z[..., None], normals_at(views, *at)
+    along = (normals * rays).sum(axis=-1)
+    read_s = views.readout.depth_s
+    if read_s:
+        late_s = read_s * views.share_of_readout(column, row)[..., None]
+        p, normals = _seen_later(p, normals, late_s, views.velocity[first, None])
     M = se3.inverse(views.T_map_camera[second]) @ views.T_map_camera[first]
     q = se3.transform(M, p)
     m = normals @ np.swapaxes(M[:, :3, :3], 1, 2)
+    there, m_there = q, m
     front = q[..., 2] > 0.05
     uv = c.project(np.where(front[..., None], q, 1.0))
+    if read_s:
+        late_s = read_s * views.share_of_readout(uv[..., 0], uv[..., 1])[..., None]
+        there, m_there = _seen_later(q, m, -late_s, views.velocity[second, None])
+        front = there[..., 2] > 0.05
+        uv = c.project(np.where(front[..., None], there, 1.0))
     inverse = look_up(views, np.broadcast_to(second[:, None], front.shape), uv[..., 0], uv[..., 1])
     seen = front & np.isfinite(inverse)
     rays_there = c.rays_at(uv[..., 0], uv[..., 1])
     z_there = rig.depth(np.where(seen, inverse, 1.0), rays_there)
-    used = seen & (np.abs(z_there - q[..., 2]) < np.maximum(GATE_M, GATE_RELATIVE * q[..., 2]))
+    z_seen = there[..., 2]
+    used = seen & (np.abs(z_there - z_seen) < np.maximum(GATE_M, GATE_RELATIVE * z_seen))
     surface = rays_there * z_there[..., None]
     sigma = _sigma(z_there)[..., None]
-    toward = (m * rays_there).sum(axis=-1)[..., None]
+    toward = (m_there * rays_there).sum(axis=-1)[..., None]
     # derivatives at the mean of both views' depths, with which the residual, their difference, does not vary
-    between = np.sqrt(np.where(used, z_there / q[..., 2], 1.0))
+    between = np.sqrt(np.where(used, z_there / z_seen, 1.0))
     z_there_by, z_by = rig.depth_by(z_there / between, rays_there), rig.depth_by(z * between, rays)
     return _Planes(
-        (m * (surface - q)).sum(axis=-1) / sigma[..., 0],
+        (m_there * (surface - there)).sum(axis=-1) / sigma[..., 0],
         used,
         -np.concatenate([normals, np.cross(p, normals)], axis=-1) / sigma,
         np.concatenate([m, np.cross(q, m)], axis=-1) / sigma,
-        (toward * z_there_by - (normals * rays).sum(axis=-1)[..., None] * z_by) / sigma,
+        (toward * z_there_by - along[..., None] * z_by) / sigma,
+    )
+
+
+def _seen_later(p: Array, normals: Array, late_s: Array, velocity: Array) -> tuple[Array, Array]:
+    """Points and normals in the frame of the camera at another time, to first order.
+
+    Args:
+        p: points [..., 3] in the frame of the camera `late_s` after that time.
+        normals: [..., 3].
+        late_s: [..., 1].
+        velocity: of the camera, [..., 6].
+    """
+    translation, rotation = velocity[..., :3], velocity[..., 3:]
+    return (
+        p + late_s * (translation + np.cross(rotation, p)),
+        normals + late_s * np.cross(rotation, normals),
     )
 
 
@@ -218,22 +246,29 @@ def _features(views: Views, rig: CameraRig) -> _Features:
     q = se3.transform(T, views.points_map[views.landmark][:, None])[:, 0]
     q[:, 2] = np.maximum(q[:, 2], 0.05)
     velocity = views.velocity[view]
-    T_color_time = se3.exp(-(rig.delay_s + views.late_s[view])[:, None] * velocity)
+    share = views.share_of_readout(views.pixel[:, 0], views.pixel[:, 1])
+    late_s = rig.delay_s + views.late_s[view] + views.readout.color_s * share
+    T_color_time = se3.exp(-late_s[:, None] * velocity)
     R = rig.R_color_depth @ T_color_time[:, :3, :3]
     p = se3.transform(T_color_time, q[:, None])[:, 0] @ rig.R_color_depth.T
     p[:, 2] = np.maximum(p[:, 2], 0.05)
     pixel, by_p, by_lens = rig.project(p)
-    uv = c.project(q)
+    there, late_s = q, (views.readout.depth_s * share)[:, None]
+    if views.readout.depth_s:
+        there, _ = _seen_later(q, q, -late_s, velocity)
+        there[:, 2] = np.maximum(there[:, 2], 0.05)
+    uv = c.project(there)
     inverse = look_up(views, view, uv[:, 0], uv[:, 1])
     seen = np.isfinite(inverse)
     rays = c.rays_at(uv[:, 0], uv[:, 1])
-    z, z_by = rig.depth(np.where(seen, inverse, 1.0), rays), rig.depth_by(q[:, 2], rays)
+    z, z_by = rig.depth(np.where(seen, inverse, 1.0), rays), rig.depth_by(there[:, 2], rays)
     at = np.rint(np.where(seen[:, None], uv, 0)).astype(np.int64)
     n = normals_at(views, view, at[:, 1], at[:, 0])
-    used = seen & (np.abs(z - q[:, 2]) < FEATURE_GATE_M) & (np.abs(n).sum(axis=-1) > 0)
+    used = seen & (np.abs(z - there[:, 2]) < FEATURE_GATE_M) & (np.abs(n).sum(axis=-1) > 0)
     n = np.where(used[:, None], n, 0.0)
     sigma = _sigma(z)[:, None]
-    by_q = np.concatenate([by_p @ R, -(n / sigma)[:, None]], axis=1)  # [k, 3, 3]
+    n_middle = _seen_later(n, n, late_s, velocity)[1] if views.readout.depth_s else n
+    by_q = np.concatenate([by_p @ R, -(n_middle / sigma)[:, None]], axis=1)  # [k, 3, 3]
     by_motion = np.concatenate([-np.broadcast_to(np.eye(3), (len(q), 3, 3)), so3.hat(q)], axis=-1)
     by_rig = np.zeros((len(q), 3, len(NAMES)))
     by_rig[:, :2, :7] = by_lens
@@ -241,7 +276,7 @@ def _features(views: Views, rig: CameraRig) -> _Features:
     moved = velocity[:, :3] + np.cross(velocity[:, 3:], q)
     by_rig[:, :2, 10] = (by_p @ (-(R @ moved[..., None])))[..., 0]
     by_rig[:, 2, 11:] = (n * rays).sum(axis=-1)[:, None] * z_by / sigma
-    distance = (n * (rays * z[:, None] - q)).sum(axis=-1) / sigma[:, 0]
+    distance = (n * (rays * z[:, None] - there)).sum(axis=-1) / sigma[:, 0]
     return _Features(pixel - views.pixel, distance, used, by_q @ by_motion, by_q @ T[:, :3, :3], by_rig)
 
 

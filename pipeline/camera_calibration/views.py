@@ -22,6 +22,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import distance_px
 from duagc.pipeline.recording import RgbdLog, open_rgbd
+from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.pipeline.registration.definition import SAME_SURFACE
 from duagc.pipeline.registration.features import gray_of, matches, nearest_pixel, strongest_keypoints
 from duagc.pipeline.registration.pyramid import RgbdPyramid
@@ -39,6 +40,7 @@ NORMALS_LEVEL = (
 )
 SAMPLES = 150  # of the depth of a view
 FARTHEST_SAMPLE_M = 4.0
+READ_AT_ONCE = Readout()
 MIN_COSINE, MAX_DISTANCE_M = 0.6, 2.0  # between the axes and the centers of views that are compared
 
 
@@ -60,6 +62,7 @@ class Views:
         points_map: [m, 3] of the landmarks.
         frames: [n], index of each in its log.
         late_s: [n], how much later than depth the log says that color was taken.
+        readout: how long images are read, row after row; poses are those in the middle of it.
     """
 
     name: str
@@ -75,6 +78,17 @@ class Views:
     points_map: Array
     frames: NDArray[np.int64]
     late_s: Array
+    readout: Readout = READ_AT_ONCE
+
+    def share_of_readout(self, u: Array, v: Array) -> Array:
+        """When pixels are read, -0.5 to 0.5: from the middle of the readout, as a share of it.
+
+        Args:
+            u: columns [...].
+            v: rows [...].
+        """
+        line = u if self.readout.by_columns else v
+        return np.asarray(np.clip(line / max(self.readout.lines(self.camera) - 1, 1), 0, 1) - 0.5)
 
 
 @dataclass(frozen=True)
@@ -88,6 +102,7 @@ class Tracked:
         ok: whether each was tracked, [n].
         held_out: whether each is kept for evaluation, [n].
         stamps_ns: [n].
+        readout: as the log states it, or the front end found it.
     """
 
     path: Path
@@ -96,6 +111,7 @@ class Tracked:
     ok: NDArray[np.bool_]
     held_out: NDArray[np.bool_]
     stamps_ns: NDArray[np.int64]
+    readout: Readout = READ_AT_ONCE
 
 
 def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
@@ -121,6 +137,8 @@ def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
         except NothingToMapError as error:
             raise UndeterminedError(str(error)) from error
         frames = RobotRun(robot, Path(folder)).frames
+        with open_rgbd(path) as log:
+            readout = log.readout if log.states_readout else Readout.found(Path(folder) / "frontend.mcap")
     return Tracked(
         path=path,
         robot=robot,
@@ -128,6 +146,7 @@ def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
         ok=np.array([frame.status == "ok" for frame in frames]),
         held_out=np.array([frame.held_out for frame in frames]),
         stamps_ns=np.array([frame.stamp_ns for frame in frames]),
+        readout=readout or READ_AT_ONCE,
     )
 
 
@@ -186,6 +205,7 @@ def load_views(tracked: Tracked, first: int, last: int, most: int, *, without: C
         points_map=points,
         frames=frames,
         late_s=np.array([image.late_s for image in images]),
+        readout=tracked.readout,
     )
 
 
