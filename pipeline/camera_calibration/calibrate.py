@@ -26,8 +26,9 @@ from duagc.pipeline.base.progress import track
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.camera_calibration.adjustment import PRIOR, Adjusted, Quality, adjust
 from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
+from duagc.pipeline.camera_calibration.tracked import Tracked, track_log
 from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
-from duagc.pipeline.camera_calibration.views import MIN_VIEWS, Tracked, Views, load_views, track_log
+from duagc.pipeline.camera_calibration.views import MIN_VIEWS, Views, load_views
 from duagc.pipeline.config.calibration import CalibrationConfig
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.recording import Recording

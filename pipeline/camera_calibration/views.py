@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
-import tempfile
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +11,8 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.progress import track
-from duagc.pipeline.base.unmapped import NothingToMapError
+from duagc.pipeline.camera_calibration.tracked import READ_AT_ONCE, Tracked
 from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
-from duagc.pipeline.config.frontend import FrontendConfig
-from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import distance_px
@@ -26,7 +21,6 @@ from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.pipeline.registration.definition import SAME_SURFACE
 from duagc.pipeline.registration.features import gray_of, matches, nearest_pixel, strongest_keypoints
 from duagc.pipeline.registration.pyramid import RgbdPyramid
-from duagc.pipeline.runs.folder import RobotRun
 
 FEATURES = 1200
 RATIO = 0.75
@@ -40,7 +34,6 @@ NORMALS_LEVEL = (
 )
 SAMPLES = 150  # of the depth of a view
 FARTHEST_SAMPLE_M = 4.0
-READ_AT_ONCE = Readout()
 MIN_COSINE, MAX_DISTANCE_M = 0.6, 2.0  # between the axes and the centers of views that are compared
 
 
@@ -89,65 +82,6 @@ class Views:
         """
         line = u if self.readout.by_columns else v
         return np.asarray(np.clip(line / max(self.readout.lines(self.camera) - 1, 1), 0, 1) - 0.5)
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """A log with the poses of its n frames.
-
-    Attributes:
-        path: of the log.
-        robot: its name.
-        T_map_camera: [n, 4, 4].
-        ok: whether each was tracked, [n].
-        held_out: whether each is kept for evaluation, [n].
-        stamps_ns: [n].
-        readout: as the log states it, or the front end found it.
-    """
-
-    path: Path
-    robot: str
-    T_map_camera: Array
-    ok: NDArray[np.bool_]
-    held_out: NDArray[np.bool_]
-    stamps_ns: NDArray[np.int64]
-    readout: Readout = READ_AT_ONCE
-
-
-def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
-    """Poses of a log by the front end, without a map.
-
-    That depth and color contradict each other is what is to be calibrated: no frame is lost for it.
-
-    Args:
-        path: of the log.
-        robot: its name.
-        config: of the front end.
-
-    Raises:
-        UndeterminedError: no frame begins a map.
-    """
-    failure = config.tracking.failure.model_copy(update={"color_check_gray_of_usual": math.inf})
-    tracking = config.tracking.model_copy(update={"failure": failure})
-    exposure = config.exposure.model_copy(update={"mode": "off"})  # only maps need it
-    config = config.model_copy(update={"mapping_enabled": False, "tracking": tracking, "exposure": exposure})
-    with tempfile.TemporaryDirectory(prefix="duagc-calibrate-") as folder:
-        try:
-            run_frontend(path, Path(folder) / "frontend.mcap", config, progress=True)
-        except NothingToMapError as error:
-            raise UndeterminedError(str(error)) from error
-        frames = RobotRun(robot, Path(folder)).frames
-        with open_rgbd(path) as log:
-            readout = log.readout if log.states_readout else Readout.found(Path(folder) / "frontend.mcap")
-    return Tracked(
-        path=path,
-        robot=robot,
-        T_map_camera=np.array([frame.T_map_camera for frame in frames]),
-        ok=np.array([frame.status == "ok" for frame in frames]),
-        held_out=np.array([frame.held_out for frame in frames]),
-        stamps_ns=np.array([frame.stamp_ns for frame in frames]),
-        readout=readout or READ_AT_ONCE,
-    )
 
 
 def load_views(tracked: Tracked, first: int, last: int, most: int, *, without: Collection[int] = ()) -> Views:

@@ -1,6 +1,7 @@
 """Cameras that are known, estimated from what they see; and recordings that do not determine them."""
 
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,20 +22,20 @@ from duagc.pipeline.camera_calibration.adjustment import (
 )
 from duagc.pipeline.camera_calibration.calibrate import calibrate
 from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
+from duagc.pipeline.camera_calibration.tracked import READ_AT_ONCE, Tracked, track_log
 from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
 from duagc.pipeline.camera_calibration.views import (
     NORMALS_LEVEL,
-    Tracked,
     Views,
     _landmarks,
     _velocities,
     load_views,
-    track_log,
 )
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, RgbdFrame, RgbdLog
+from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 CAMERA = PinholeCamera(320, 240, 262.0, 262.0, 160.0, 118.0)
@@ -64,7 +65,12 @@ def pose(k: int) -> np.ndarray:
 
 
 def make_views(
-    seed: int, noise_per_m: float = 0.001, count: int = 150, landmarks_count: int = LANDMARKS
+    seed: int,
+    noise_per_m: float = 0.001,
+    count: int = 150,
+    landmarks_count: int = LANDMARKS,
+    *,
+    readout: Readout = READ_AT_ONCE,
 ) -> Views:
     """Views of the room as the true cameras see it, with noise of 1/z and samples, at poses that are a little wrong."""
     rng = np.random.default_rng(seed)
@@ -74,8 +80,12 @@ def make_views(
     x, y = rays[..., 0], rays[..., 1]
     error = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1) @ TRUE.depth_error
     inverse, normals, samples, depths = [], [], [], []
+    share = np.arange(CAMERA.height) / (CAMERA.height - 1) - 0.5
+    T_row = T[:, None] @ se3.exp(readout.depth_s * share[:, None] * velocity[:, None])
     for k in range(VIEWS):
-        depth = distance(T[k, :3, 3], rays.reshape(-1, 3) @ T[k, :3, :3].T).reshape(rays.shape[:2])
+        depth = np.stack(
+            [distance(M[:3, 3], row @ M[:3, :3].T) for M, row in zip(T_row[k], rays, strict=True)]
+        )
         depths.append(depth)
         measured = (1 / depth - error) / (1 - 2 * TRUE.depth_error[0])
         measured = 1 / (1 / measured + rng.normal(size=depth.shape) * noise_per_m)
@@ -88,14 +98,17 @@ def make_views(
         samples.append(np.stack([u[picked], v[picked]], axis=-1) << NORMALS_LEVEL)
     late_s = np.random.default_rng(100 + seed).uniform(-0.01, 0.01, VIEWS)
     to_camera = se3.inverse(T)
-    to_exposure = se3.exp(-(TRUE.delay_s + late_s)[:, None] * velocity)
     points, seen_by, landmarks, pixels = [], [], [], []
     for m in range(landmarks_count):
         k, u, v = rng.integers(VIEWS), rng.integers(5, 315), rng.integers(5, 235)
-        points.append(se3.transform(T[k], (rays[v, u] * depths[k][v, u])[None])[0])
+        points.append(se3.transform(T_row[k, v], (rays[v, u] * depths[k][v, u])[None])[0])
         q = se3.transform(to_camera, points[m][None])
-        p = (se3.transform(to_exposure, q) @ TRUE.R_color_depth.T)[:, 0]
-        pixel = TRUE.project(p)[0]
+        read_s = np.zeros(VIEWS)
+        for _ in range(6):  # the row that sees a point is that which is read when it does
+            to_exposure = se3.exp(-(TRUE.delay_s + late_s + read_s)[:, None] * velocity)
+            p = (se3.transform(to_exposure, q) @ TRUE.R_color_depth.T)[:, 0]
+            pixel = TRUE.project(p)[0]
+            read_s = readout.color_s * (np.clip(pixel[:, 1] / (CAMERA.height - 1), 0, 1) - 0.5)
         seen = (q[:, 0, 2] >= 0.1) & ((pixel >= 0) & (pixel < (320, 240))).all(axis=1)
         seen &= np.hypot(*(p[:, :2] / p[:, 2:]).T) < 0.75
         for i in np.flatnonzero(seen).tolist():
@@ -119,6 +132,7 @@ def make_views(
         np.reshape(points, (-1, 3)) + rng.normal(size=(landmarks_count, 3)) * 0.01,
         np.arange(VIEWS),
         late_s,
+        readout,
     )
 
 
@@ -127,8 +141,18 @@ def views() -> Views:
     return make_views(0)
 
 
-def test_derivatives_are_those_of_the_residuals(views: Views) -> None:
+ROLLING = Readout(color_s=0.03, depth_s=0.025)
+
+
+@pytest.fixture(scope="module")
+def rolling_views() -> Views:
+    return make_views(1, readout=ROLLING)
+
+
+@pytest.mark.parametrize("which", ["views", "rolling_views"])
+def test_derivatives_are_those_of_the_residuals(which: str, request: pytest.FixtureRequest) -> None:
     """By differences; those of depth roughly, for sigma(z), which divides it, is held."""
+    views: Views = request.getfixturevalue(which)
     step = 1e-6
     features = _features(views, TRUE)
     for k in range(len(NAMES)):
@@ -188,6 +212,22 @@ def test_known_cameras_are_found(views: Views) -> None:
     held_out = adjust([copy(views)], found.rig, False).quality[0]
     assert held_out.features_px < 0.5 * as_recorded.features_px
     assert held_out.depth < as_recorded.depth
+
+
+def test_cameras_that_read_row_after_row_are_found(rolling_views: Views) -> None:
+    """Within their standard deviations; were the rows taken for one time, views would agree less."""
+    found = adjust([copy(rolling_views)], CameraRig.of(CAMERA), True)
+    assert found.covariance is not None
+    off = np.abs(found.rig.values() - TRUE.values())
+    for name, value, limit in zip(
+        NAMES, off, np.maximum(4 * np.sqrt(np.diag(found.covariance)), 1e-3), strict=True
+    ):
+        assert value < limit, name
+    at_once = adjust([replace(rolling_views, readout=READ_AT_ONCE)], CameraRig.of(CAMERA), True)
+    quality, at_once_quality = found.quality[0], at_once.quality[0]
+    assert quality.features_px < 0.5 * at_once_quality.features_px
+    assert quality.depth_of_features < 0.8 * at_once_quality.depth_of_features
+    assert quality.depth < 0.8 * at_once_quality.depth
 
 
 def test_a_robot_whose_images_show_nothing_to_follow_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
