@@ -41,6 +41,7 @@ Part = tuple[Tracked, int, int]
 MIN_LANDMARKS = 200  # of a half
 UNKNOWN = 0.7  # share of its prior standard deviation from which a number counts as undetermined
 QUALITIES = ("features_px", "depth_of_features", "depth")
+TOO_SMALL = 0.1  # px, or standard deviations of depth: views that agree this well have exact cameras
 BY_OTHER, BY_BOTH = "the other half", "both halves"
 
 
@@ -61,8 +62,11 @@ class Judged:
     after: Quality
 
     def ratios(self) -> list[float]:
-        """After over before, of each of `QUALITIES`."""
-        return [getattr(self.after, name) / max(getattr(self.before, name), 1e-12) for name in QUALITIES]
+        """After over before, of each of `QUALITIES`, as far as they are not too small to tell."""
+        return [
+            max(getattr(self.after, name), TOO_SMALL) / max(getattr(self.before, name), TOO_SMALL)
+            for name in QUALITIES
+        ]
 
 
 @dataclass(frozen=True)

@@ -197,13 +197,18 @@ def format_calibration(found: Calibration) -> str:
         )
     lines += ["", "agreement of views that a calibration did not use: as recorded -> calibrated"]
     lines += [change(judged) for judged in found.judged]
-    why = not_taken(found.recording)
-    lines += [
-        "",
-        "--apply REC writes the recording with these cameras",
-        f"the recording {why}" if why else "--out FILE.toml writes this as options for duagc convert",
-    ]
     return "\n".join(lines)
+
+
+def uses(found: Calibration) -> str:
+    """What can be done with a calibration that is better, in two lines.
+
+    Args:
+        found: the calibration.
+    """
+    why = not_taken(found.recording)
+    options = f"the recording {why}" if why else "--out FILE.toml writes this as options for duagc convert"
+    return f"--apply REC writes the recording with these cameras\n{options}"
 
 
 def changes(found: Calibration, delay_ns: int) -> list[str]:

@@ -157,6 +157,8 @@ def calibrate(
         print(json.dumps(report.plain(found), indent=2) if as_json else report.format_calibration(found))
         if refused := found.refusal(settings.calibration):
             raise DuagError(f"{path}: found no better calibration than its own: {refused}")
+        if not as_json and out is None and apply is None:
+            print(f"\n{report.uses(found)}")
         if folder is not None and apply is not None:
             from duagc.pipeline.recalibration import CalibrationOutcome, write
 

@@ -14,13 +14,14 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.camera_calibration import calibrate as calibration
 from duagc.pipeline.camera_calibration.adjustment import (
+    Quality,
     _features,
     _of_planes,
     _planes,
     adjust,
     overlapping,
 )
-from duagc.pipeline.camera_calibration.calibrate import calibrate
+from duagc.pipeline.camera_calibration.calibrate import Judged, calibrate
 from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
 from duagc.pipeline.camera_calibration.tracked import READ_AT_ONCE, Tracked, track_log
 from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
@@ -268,6 +269,15 @@ def test_a_robot_of_few_frames_is_left_out(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(calibration, "track_log", tracked)
     monkeypatch.setattr(calibration, "load_views", loaded)
     assert calibrate(Path("team"), FrontendConfig(), []).names == ["room 0", "room 1"]
+
+
+def test_agreement_of_exact_cameras_is_no_better_for_being_smaller() -> None:
+    exact = Judged("half", "the other half", Quality(0.15, 0.04, 0.012), Quality(0.15, 0.02, 0.008))
+    assert exact.ratios() == [1.0, 1.0, 1.0]
+    spoiled = replace(exact, after=Quality(0.15, 0.4, 0.008))
+    assert spoiled.ratios() == pytest.approx([1.0, 4.0, 1.0])
+    unknown = replace(exact, after=Quality(np.nan, 0.02, 0.008))
+    assert np.isnan(unknown.ratios()[0])
 
 
 def test_a_view_that_sees_nothing_of_the_others_moves_nothing(views: Views) -> None:

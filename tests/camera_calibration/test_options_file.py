@@ -97,7 +97,7 @@ def test_the_file_of_options_is_one_of_the_converter(tmp_path: Path) -> None:
     assert line in text
     text = report.format_calibration(found)
     assert line in text
-    assert "--out FILE.toml" in text
+    assert "--out FILE.toml" in report.uses(found)
     (tmp_path / "other.toml.part").mkdir()
     with pytest.raises(DuagError, match=r"other.toml: Is a directory, expected to write options"):
         report.write(found, tmp_path / "other.toml")
@@ -112,7 +112,7 @@ def test_recordings_that_take_no_calibration() -> None:
         (replace(found_by("7scenes"), recording=calibrated), "is calibrated already, expected one as its"),
     ):
         assert report.options(other) is None
-        assert why in report.format_calibration(other)
+        assert why in report.uses(other)
         with pytest.raises(ValueError, match=why):
             report.toml(other)
     assert json.loads(json.dumps(report.plain(found_by("tum"))))["values"]["fx"]["value"] == 266
