@@ -253,9 +253,9 @@ def _features(views: Views, rig: CameraRig) -> _Features:
     p = se3.transform(T_color_time, q[:, None])[:, 0] @ rig.R_color_depth.T
     p[:, 2] = np.maximum(p[:, 2], 0.05)
     pixel, by_p, by_lens = rig.project(p)
-    there, late_s = q, (views.readout.depth_s * share)[:, None]
+    there, depth_late_s = q, (views.readout.depth_s * share)[:, None]
     if views.readout.depth_s:
-        there, _ = _seen_later(q, q, -late_s, velocity)
+        there, _ = _seen_later(q, q, -depth_late_s, velocity)
         there[:, 2] = np.maximum(there[:, 2], 0.05)
     uv = c.project(there)
     inverse = look_up(views, view, uv[:, 0], uv[:, 1])
@@ -267,7 +267,7 @@ def _features(views: Views, rig: CameraRig) -> _Features:
     used = seen & (np.abs(z - there[:, 2]) < FEATURE_GATE_M) & (np.abs(n).sum(axis=-1) > 0)
     n = np.where(used[:, None], n, 0.0)
     sigma = _sigma(z)[:, None]
-    n_middle = _seen_later(n, n, late_s, velocity)[1] if views.readout.depth_s else n
+    n_middle = _seen_later(n, n, depth_late_s, velocity)[1] if views.readout.depth_s else n
     by_q = np.concatenate([by_p @ R, -(n_middle / sigma)[:, None]], axis=1)  # [k, 3, 3]
     by_motion = np.concatenate([-np.broadcast_to(np.eye(3), (len(q), 3, 3)), so3.hat(q)], axis=-1)
     by_rig = np.zeros((len(q), 3, len(NAMES)))

@@ -160,7 +160,7 @@ def _pool(workers: int) -> Iterator[Pool]:
 
 
 def _later(pool: Pool, task: Callable[..., Found], *arguments: Any, **named: Any) -> Callable[[], Found]:
-    """Gives what a task finds: of this process, when it is asked for first."""
+    """What a task finds, when it is asked for: the pool begins it now, this process when it is asked for first."""
     if pool is None:
         return cache(partial(task, *arguments, **named))
     return pool.submit(task, *arguments, **named).result
