@@ -147,7 +147,7 @@ def calibrate(
         DuagError: the recording is broken, or the robots have different cameras.
     """
     with _pool(workers) as pool:
-        return _calibration(folder, config, robots, views, pool)
+        return _calibration(folder, config, robots, views, pool=pool)
 
 
 @contextmanager
@@ -167,7 +167,7 @@ def _later(pool: Pool, task: Callable[..., Found], *arguments: Any, **named: Any
 
 
 def _calibration(
-    folder: Path, config: FrontendConfig, robots: Sequence[str], views: int, pool: Pool
+    folder: Path, config: FrontendConfig, robots: Sequence[str], views: int, *, pool: Pool
 ) -> Calibration:
     source = Recording(folder)
     for robot in robots:
@@ -198,7 +198,7 @@ def _calibration(
             )
     loading_between = [_later(pool, _between, of, part.frames, most) for half in kept for of, part in half]
     between = [found_between for load in loading_between if (found_between := load()) is not None]
-    return _calibrate(folder, halves, between, source.description, pool)
+    return _calibrate(folder, halves, between, source.description, pool=pool)
 
 
 def _track(logs: dict[str, Path], config: FrontendConfig, pool: Pool) -> list[Tracked]:
@@ -238,7 +238,7 @@ def _between(of: Part, used: NDArray[np.int64], most: int) -> Views | None:
 
 
 def _calibrate(
-    folder: Path, halves: list[list[Views]], between: list[Views], description: dict[str, Any], pool: Pool
+    folder: Path, halves: list[list[Views]], between: list[Views], description: dict[str, Any], *, pool: Pool
 ) -> Calibration:
     start = CameraRig.of(halves[0][0].camera)
     done = list(track(_adjustments(halves, between, start, pool), "adjust", total=9 if between else 7))
