@@ -31,7 +31,7 @@ from duagc.pipeline.geometry.lens import Lens, Maps, rectified, seen_by_source
 from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.recording import DEPTH_SCALE_KEY, RECORDING_FILE, LogWriter, Record, Recording, open_rgbd
 from duagc.pipeline.recording.color_images import ColorImages
-from duagc.pipeline.recording.depth_sources import Lidar, OtherCamera, depth_source
+from duagc.pipeline.recording.depth_sources import OtherCamera, depth_source
 from duagc.pipeline.recording.read import LogFile, log_metadata
 from duagc.schemas import topics
 
@@ -61,8 +61,8 @@ def why_not(log: Path) -> str:
     Raises:
         DuagError: the log is broken.
     """
-    with open_rgbd(log) as rgbd, LogFile(log) as file:
-        if isinstance(depth_source(file, rgbd.robot, rgbd.camera), Lidar):
+    with open_rgbd(log) as rgbd:
+        if rgbd.swept:
             topic = topics.LIDAR.of(rgbd.robot)
             return f"{log}: depth comes from {topic}, expected images of a depth camera to calibrate"
     return ""

@@ -98,7 +98,7 @@ class Chain:
         """The recording with its cameras calibrated, if that is better; no file, if it is not.
 
         Args:
-            workers: robots that are tracked at the same time; changes no bit of the result.
+            workers: tasks that are done at the same time; changes no bit of the result.
         """
         carrier, recording = self._carrier, self._recording
 

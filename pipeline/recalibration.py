@@ -86,7 +86,7 @@ def calibrated(
         folder: gives the folder to write into; called if there is something to write.
         name: of the new recording.
         config: of the calibration, and of the front end that tracks the recording.
-        workers: robots that are tracked at the same time; changes no bit of the result.
+        workers: tasks that are done at the same time; changes no bit of the result.
 
     Returns:
         What was found about each camera, and whether a recording was written.

@@ -159,11 +159,11 @@ def _pool(workers: int) -> Iterator[Pool]:
             yield pool
 
 
-def _later(pool: Pool, task: Callable[..., Found], *arguments: Any, **named: Any) -> Callable[[], Found]:
+def _later(pool: Pool, task: Callable[..., Found], *arguments: Any) -> Callable[[], Found]:
     """What a task finds, when it is asked for: the pool begins it now, this process when it is asked for first."""
     if pool is None:
-        return cache(partial(task, *arguments, **named))
-    return pool.submit(task, *arguments, **named).result
+        return cache(partial(task, *arguments))
+    return pool.submit(task, *arguments).result
 
 
 def _calibration(
@@ -287,7 +287,7 @@ def _adjustments(
     """
     alone = [_later(pool, _adjusted, half, start, True) for half in halves]
     both = _later(pool, _adjusted, [part for half in halves for part in half], start, True)
-    recorded = [_later(pool, _adjusted, part, start, False) for part in (*halves, between) if part]
+    recorded = [_later(pool, _adjusted, half, start, False) for half in halves]
     for task in alone:
         yield task()
     by_other = [
@@ -295,8 +295,9 @@ def _adjustments(
         for half, other in zip(halves, reversed(alone), strict=True)
     ]
     yield both()
-    by_both = [_later(pool, _adjusted, part, both().rig, False) for part in (between,) if part]
-    for task in (*recorded[:2], *by_other, *recorded[2:], *by_both):
+    rigs = (start, both().rig) if between else ()
+    of_between = [_later(pool, _adjusted, between, rig, False) for rig in rigs]
+    for task in (*recorded, *by_other, *of_between):
         yield task()
 
 

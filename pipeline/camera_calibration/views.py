@@ -17,7 +17,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import distance_px
 from duagc.pipeline.recording import RgbdLog, open_rgbd
-from duagc.pipeline.recording.rolling_shutter import Readout
+from duagc.pipeline.recording.rolling_shutter import Readout, share_of_readout
 from duagc.pipeline.registration.definition import SAME_SURFACE
 from duagc.pipeline.registration.features import gray_of, matches, nearest_pixel, strongest_keypoints
 from duagc.pipeline.registration.pyramid import RgbdPyramid
@@ -74,14 +74,14 @@ class Views:
     readout: Readout = READ_AT_ONCE
 
     def share_of_readout(self, u: Array, v: Array) -> Array:
-        """When pixels are read, -0.5 to 0.5: from the middle of the readout, as a share of it.
+        """`rolling_shutter.share_of_readout` of pixels; beyond the border that of the border.
 
         Args:
             u: columns [...].
             v: rows [...].
         """
-        line = u if self.readout.by_columns else v
-        return np.asarray(np.clip(line / max(self.readout.lines(self.camera) - 1, 1), 0, 1) - 0.5)
+        count = self.readout.lines(self.camera)
+        return share_of_readout(np.clip(u if self.readout.by_columns else v, 0, count - 1), count)
 
 
 def load_views(tracked: Tracked, first: int, last: int, most: int, *, without: Collection[int] = ()) -> Views:

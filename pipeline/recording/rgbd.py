@@ -17,7 +17,7 @@ from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.geometry.open_shutter import OpenShutter
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.color_images import ColorImages
-from duagc.pipeline.recording.depth_sources import DepthImage, check_size, constant, depth_source
+from duagc.pipeline.recording.depth_sources import DepthImage, Lidar, check_size, constant, depth_source
 from duagc.pipeline.recording.motion import MotionPrior, motion_prior
 from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, move_depth, tracked_frames
 from duagc.pipeline.recording.pairing import pair, pair_topics
@@ -205,6 +205,11 @@ class RgbdLog:
         """
         color, depth = self.pairing.pairs[index]
         return 0 if depth is None else depth - color
+
+    @property
+    def swept(self) -> bool:
+        """Whether depth comes from the sweeps of a LiDAR."""
+        return isinstance(self._source, Lidar)
 
     @property
     def states_readout(self) -> bool:

@@ -129,6 +129,16 @@ def known_lines(count: int) -> NDArray[np.int64]:
     return lines
 
 
+def share_of_readout(lines: Array | NDArray[np.int64], count: int) -> Array:
+    """When rows, or columns, of an image are read, -0.5 to 0.5: from the middle of the readout, as a share of it.
+
+    Args:
+        lines: which, [...]; of places between them, fractions.
+        count: that the image has.
+    """
+    return np.asarray(lines / max(count - 1, 1) - 0.5)
+
+
 def line_times_ns(lines: NDArray[np.int64], count: int, readout_s: float) -> NDArray[np.int64]:
     """Times of rows, or columns, of an image from that of its middle.
 
@@ -137,7 +147,7 @@ def line_times_ns(lines: NDArray[np.int64], count: int, readout_s: float) -> NDA
         count: that it has.
         readout_s: from the first to the last.
     """
-    return np.rint(1e9 * readout_s * (lines / max(count - 1, 1) - 0.5)).astype(np.int64)
+    return np.rint(1e9 * readout_s * share_of_readout(lines, count)).astype(np.int64)
 
 
 def all_lines(T_middle_line: Array, count: int) -> Array:

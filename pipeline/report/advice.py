@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.recording import Recording, open_rgbd
-from duagc.pipeline.recording.depth_sources import Lidar, depth_source
-from duagc.pipeline.recording.read import LogFile
 from duagc.pipeline.runs.folder import RunFolder
 
 APART_PX = 1.0
@@ -41,6 +39,5 @@ def calibration_advice(run: RunFolder, source: Recording) -> str:
 
 
 def _by_lidar(source: Recording, name: str) -> bool:
-    log = source.log(robot_of(name))
-    with open_rgbd(log) as rgbd, LogFile(log) as file:
-        return isinstance(depth_source(file, rgbd.robot, rgbd.camera), Lidar)
+    with open_rgbd(source.log(robot_of(name))) as log:
+        return log.swept
