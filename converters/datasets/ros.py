@@ -2,8 +2,9 @@
 
 SRC is a `.bag`, a `.db3`, an `.mcap` or a folder of `ros2 bag`; a folder with one of these per robot, or with a folder
 of them per robot; or a TOML file that says which logs and topics each robot has (`duagc info LOG --toml`). Images are
-paired by the stamps of their headers. Color keeps its distortion, and depth that another camera saw is registered to it
-as it looks without, with extrinsics from the log's constant transforms or given ones.
+paired by the stamps of their headers; messages that hold both (RealSense's RGBD, RTAB-Map's RGBDImage) are read as
+topics below their own. Color keeps its distortion, and depth that another camera saw is registered to it as it looks
+without, with extrinsics from the log's constant transforms or given ones.
 """
 
 from __future__ import annotations

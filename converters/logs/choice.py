@@ -10,7 +10,9 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from duagc.converters.layouts.ros_images import is_depth, is_unusable
+from duagc.converters.logs.entries import LogTopic, ros_type
 from duagc.converters.logs.files import Log, is_below
+from duagc.converters.logs.rgbd_messages import holds_rgbd
 from duagc.converters.logs.video import is_video
 from duagc.pipeline.base.errors import DuagError, closest
 
@@ -75,11 +77,10 @@ class Chooser:
         self.images: dict[str, Any] = {
             t: first_usable(log, t) for t in log.of_type(*IMAGE_TYPES, below=self.namespace)
         }
-        self.unread = ""  # what to add to a complaint that there are no images: why video has none
-        films = sorted(t.name for t in log.topics.values() if is_video(t.type) and t.count)
-        for topic in films:
-            if is_below(topic, self.namespace):
-                self._add_video(topic)
+        self.unread = ""  # what to add to a complaint that there are no images: why others have none
+        for topic in sorted(log.topics.values(), key=lambda t: t.name):
+            if topic.count and is_below(topic.name, self.namespace):
+                self._add_held(topic)
         self.infos = log.of_type(INFO_TYPE, below=self.namespace)
         self.clouds = log.of_type(POINTS_TYPE, below=self.namespace)
 
@@ -87,7 +88,7 @@ class Chooser:
         """Images that are not depth, and are not named so."""
         found = [t for t, m in self.images.items() if not is_depth(m) and not self._is_named_depth(t)]
         left = LEFT if self._wanted.get("depth_from") == "stereo" else ()
-        choice = self._one("color", self._without_video(found), (*left, "color", "rgb"))
+        choice = self._one("color", self._preferred(found), (*left, "color", "rgb"))
         return choice if choice.topic else replace(choice, why=choice.why + self.unread)
 
     def depth(self) -> Choice:
@@ -100,14 +101,14 @@ class Chooser:
             left = self.color().topic
             others = [t for t, m in self.images.items() if t != left and not is_depth(m)]
             others = [t for t in others if not self._is_named_depth(t)]
-            return self._one("depth", self._without_video(others), RIGHT, "right")
+            return self._one("depth", self._preferred(others), RIGHT, "right")
         if source == "lidar":
             if not self.clouds:
                 return Choice("", f"no topic holds {POINTS_TYPE}{packet_words(self.log, self.namespace)}")
             return self._one("depth", self.clouds, (), "point", known=self.clouds)
         found = [t for t, m in self.images.items() if is_depth(m)]
         sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
-        choice = self._one("depth", sure or found, REGISTERED)
+        choice = self._one("depth", self._preferred(sure or found), REGISTERED)
         lost = [t for t, m in self.images.items() if self._is_named_depth(t) and not is_depth(m)]
         if not choice.topic and not choice.candidates and self.clouds:
             choice = replace(choice, why=f"{choice.why}, but there are points (depth_from=lidar)")
@@ -139,16 +140,21 @@ class Chooser:
             return Choice("", f"{image_topic} has CameraInfo on {', '.join(self.infos)}", tuple(self.infos))
         return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
 
-    def _add_video(self, topic: str) -> None:
-        """The images of video, if its messages can be read: bags may lack their definition."""
+    def _add_held(self, topic: LogTopic) -> None:
+        """The images of video, or why messages that hold images cannot be read: bags may lack their definition."""
         try:
-            self.images[topic] = first_usable(self.log, topic)
+            if is_video(topic.type):
+                self.images[topic.name] = first_usable(self.log, topic.name)
+            elif holds_rgbd(topic.type):  # its images have topics of their own
+                self.log.first(topic.name)
         except DuagError as error:
             self.unread += f"; {error}"
 
-    def _without_video(self, topics: Sequence[str]) -> Sequence[str]:
-        """Topics of images, if there are any: video often repeats them, with losses."""
-        return [t for t in topics if not is_video(self.log.topics[t].type)] or topics
+    def _preferred(self, topics: Sequence[str]) -> Sequence[str]:
+        """Topics of images, if there are any; else of messages that hold both: they and video repeat images."""
+        kinds = [self.log.topics[topic] for topic in topics]
+        ranks = [2 if is_video(t.type) else int(holds_rgbd(ros_type(t.schema))) for t in kinds]
+        return [topic for topic, rank in zip(topics, ranks, strict=True) if rank == min(ranks)]
 
     def _is_named_depth(self, topic: str) -> bool:
         """Whether a topic is named as depth; the name of a sensor of both (/depth_cam/rgb) does not count."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from duagc.pipeline.base.errors import DuagError
 
@@ -50,6 +51,22 @@ class Entry:
     data: bytes
     read: Callable[[], Any]
     header_ns: Callable[[], int]
+
+
+class LogPart(Protocol):
+    """One container file, or a folder of `ros2 bag`."""
+
+    path: Path
+    topics: dict[str, LogTopic]
+
+    def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
+        """Messages of these topics in order of recording.
+
+        heads: those of which `header_ns` is all that will be asked; `data` may be cut behind it.
+        """
+        ...
+
+    def close(self) -> None: ...
 
 
 def sound_time(time_ns: int, where: str) -> int:

@@ -16,31 +16,16 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from duagc.converters.logs.entries import Entry, LogTopic
+from duagc.converters.logs.entries import Entry, LogPart, LogTopic
+from duagc.converters.logs.rgbd_messages import with_members
 from duagc.converters.logs.video import images, is_video
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording.names import LOG_RECORD, MAGIC
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 HEAD_BYTES = 1024
-
-
-class LogPart(Protocol):
-    """One container file, or a folder of `ros2 bag`."""
-
-    path: Path
-    topics: dict[str, LogTopic]
-
-    def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
-        """Messages of these topics in order of recording.
-
-        heads: those of which `header_ns` is all that will be asked; `data` may be cut behind it.
-        """
-        ...
-
-    def close(self) -> None: ...
 
 
 class Log:
@@ -132,8 +117,9 @@ def open_log(paths: Sequence[Path], name: str = "") -> Log:
     parts: list[LogPart] = []
     with ExitStack() as opened:
         for path in paths:
-            parts.append(_open_part(path))
-            opened.callback(parts[-1].close)
+            part = _open_part(path)
+            opened.callback(part.close)
+            parts.append(with_members(part))
         log = Log(parts, name or str(paths[0]))
         opened.pop_all()
     return log

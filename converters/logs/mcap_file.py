@@ -15,6 +15,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from duagc import schemas
 from duagc.converters.logs import foxglove, ros_json
+from duagc.converters.logs.definitions import of_ros2
 from duagc.converters.logs.entries import Entry, LogTopic, ros_type, sound_time, stamp_ns
 from duagc.converters.logs.mcap_chunks import Chunks
 from duagc.converters.logs.rosbag_file import (
@@ -27,7 +28,7 @@ from duagc.converters.logs.rosbag_file import (
 )
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
-from duagc.pipeline.recording.names import MAGIC
+from duagc.pipeline.recording.names import MAGIC, is_mcap
 
 WANTED = "a sound MCAP log"
 
@@ -49,11 +50,11 @@ class McapFile:
                 raise
 
     def _open(self) -> None:
-        self._stream.seek(-min(len(MAGIC), self.path.stat().st_size), 2)
+        if not is_mcap(self.path):
+            raise DuagError(f"{self.path}: is no MCAP, expected {WANTED}")
+        self._stream.seek(-len(MAGIC), 2)
         if self._stream.read() != MAGIC:
-            raise DuagError(
-                f"{self.path}: is cut short or no MCAP; what it holds can be saved with `duagc recover`"
-            )
+            raise DuagError(f"{self.path}: is cut short; what it holds can be saved with `duagc recover`")
         self._stream.seek(0)
         reader = SeekingReader(self._stream, validate_crcs=True, record_size_limit=LARGEST_CHUNK)
         summary = reader.get_summary()
@@ -223,7 +224,7 @@ class _Ros:
 
         text = self.schema.data.decode()
         if not text.strip():  # a recorder that had no definitions at hand
-            return get_typestore(Stores.ROS2_HUMBLE if self.encoding == "cdr" else Stores.ROS1_NOETIC)
+            return of_ros2() if self.encoding == "cdr" else get_typestore(Stores.ROS1_NOETIC)
         store = get_typestore(Stores.EMPTY)
         if self.schema.encoding != "ros2idl":
             store.register(get_types_from_msg(text, self.type))

@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 from duagc.converters.logs import foxglove
 from duagc.converters.logs.bag_messages import messages
+from duagc.converters.logs.definitions import of_ros2
 from duagc.converters.logs.entries import NANOSECONDS, Entry, LogTopic, sound_time, stamp_ns
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, read_text
@@ -30,7 +31,7 @@ LARGEST_CHUNK = 256 << 20  # bytes, unpacked; recorders write some megabytes
 
 
 class RosBag:
-    """A bag, read by rosbags. Bags of ROS 2 without types are read with those of Humble."""
+    """A bag, read by rosbags. Bags of ROS 2 without types are read with those of `definitions`."""
 
     def __init__(self, path: Path) -> None:
         from rosbags.rosbag1 import Reader as Reader1
@@ -112,14 +113,13 @@ class _UriPath(PosixPath):
 def _opened(path: Path) -> Any:
     """`AnyReader` of a bag; definitions of types that are not read here may be broken."""
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
 
     path = _UriPath(path) if set("#%?") & set(str(path)) else path
-    reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    reader: Any = AnyReader([path], default_typestore=of_ros2())
     try:
         reader.open()
     except Exception:  # of a bag that is broken itself it comes again
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader([path], default_typestore=of_ros2())
         reader._open = partial(_open_sound_types, reader)
         reader.open()
     return reader

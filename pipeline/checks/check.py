@@ -18,7 +18,7 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import MotionPrior, Recording, RgbdLog, log_metadata, open_rgbd
-from duagc.pipeline.recording.names import DIGEST_RECORD
+from duagc.pipeline.recording.names import DIGEST_RECORD, is_mcap
 from duagc.pipeline.recording.read import LogFile, verify
 
 __all__ = ["Finding", "Report", "Severity", "check", "check_registration", "format_report"]
@@ -75,7 +75,7 @@ def _remedy(log: Path | None) -> str:
     try:
         verify(log)
     except DuagError:
-        return "duagc recover may save it"
+        return "duagc recover may save it" if is_mcap(log) else ""
     return "duagc info says what is in it"
 
 

@@ -1,5 +1,8 @@
 """Names and numbers that writers and readers of logs share."""
 
+import os
+from pathlib import Path
+
 from duagc import __version__
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -12,3 +15,11 @@ RECORDING_FILE = "recording.json"
 RECORDING_FORMAT = "duagc.recording"
 RECORDING_SCHEMA = 1
 RANGE_SIGMA_KEY = "range_sigma"  # channel metadata of a LiDAR: standard deviation of its ranges, m
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a file begins or ends as MCAP does, whatever else is wrong with it."""
+    with path.open("rb") as stream:
+        head = stream.read(len(MAGIC))
+        stream.seek(-len(head), os.SEEK_END)
+        return MAGIC in (head, stream.read())

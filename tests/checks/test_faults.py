@@ -279,6 +279,13 @@ def test_logs_that_cannot_be_read_are_findings(sound: Path, tmp_path: Path) -> N
     assert "nothing found" in result.stdout
 
 
+@pytest.mark.parametrize("content", [b"", b"not a log at all" * 10])
+def test_what_is_no_log_is_not_to_be_recovered(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "alpha.mcap").write_bytes(content)
+    (finding,) = check.check(tmp_path / "alpha.mcap").findings
+    assert (finding.severity, finding.advice) == ("error", "")
+
+
 def test_a_sound_log_without_a_camera_is_not_to_be_recovered(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "alpha.mcap", "alpha") as log:
         reading = m.pack_imu(0, "alpha", np.zeros(3), np.array([0.0, 0.0, 9.8]))

@@ -27,8 +27,10 @@ def test_broken_files_are_errors(tmp_path: Path) -> None:
     log = write(tmp_path / "log.mcap", scene(r), "protobuf", r)
     data = log.read_bytes()
     for name, broken, message in (
-        ("cut", data[: len(data) // 2], "cut short or no MCAP"),
-        ("empty", b"", "cut short or no MCAP"),
+        ("cut", data[: len(data) // 2], "is cut short; what it holds can be saved with `duagc recover`"),
+        ("headless", data[100:], "expected a sound MCAP log"),
+        ("empty", b"", "is no MCAP, expected a sound MCAP log"),
+        ("text", b"not a log at all" * 10, "is no MCAP, expected a sound MCAP log"),
         ("flipped", data[:5000] + bytes([data[5000] ^ 4]) + data[5001:], "expected a sound MCAP log"),
     ):
         path = tmp_path / f"{name}.mcap"
