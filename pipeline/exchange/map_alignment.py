@@ -37,6 +37,7 @@ class MapAlignment:
         self.links = 0  # all pairs known, revoked ones too, a mask of pair_bit
         self.revoked = 0  # links known to have been revoked, likewise
         self._pair_of: dict[bytes, Pair] = {}  # by payload
+        self._members: list[int] = []
         self._placement: Placement | None = None
 
     def receive(self, payload: bytes, held: Callable[[Pair], bool]) -> Pair:
@@ -67,11 +68,11 @@ class MapAlignment:
     def _know(self, pair: Pair, frames: RelativeFrames, payload: bytes) -> None:
         self.pairs[pair], self.payloads[pair], self._pair_of[payload] = frames, payload, pair
         self.links |= pair_bit(*pair)
-        self._placement = None
+        self._members, self._placement = [], None
 
     def revoke(self, known: int) -> None:
         """Revoke these links, a mask of `pair_bit`: they do not count any more."""
-        self.revoked, self._placement = known, None
+        self.revoked, self._members, self._placement = known, [], None
 
     def _alive(self) -> list[Pair]:
         return [pair for pair in sorted(self.pairs) if not self.revoked & pair_bit(*pair)]
@@ -79,10 +80,12 @@ class MapAlignment:
     @property
     def members(self) -> list[int]:
         """Robots that the links join with this one, itself included, ascending."""
-        reached, alive = {self.own}, self._alive()
-        while more := {robot for pair in alive if reached & set(pair) for robot in pair} - reached:
-            reached |= more
-        return sorted(reached)
+        if not self._members:
+            reached, alive = {self.own}, self._alive()
+            while more := {robot for pair in alive if reached & set(pair) for robot in pair} - reached:
+                reached |= more
+            self._members = sorted(reached)
+        return list(self._members)
 
     @property
     def root(self) -> int:

@@ -109,7 +109,8 @@ class Recording:
 
 def _read_description(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise DuagError(f"{path}: no such file, expected a recording (a folder with {RECORDING_FILE})")
+        other = "; `duagc convert` makes one of logs and datasets" if path.parent.exists() else ""
+        raise DuagError(f"{path}: no such file, expected a recording (a folder with {RECORDING_FILE}){other}")
     try:
         description = json.loads(read_bytes(path, "the JSON of a recording"))
     except (ValueError, RecursionError) as error:
