@@ -1,7 +1,9 @@
 """Video in logs: packets of H.264, H.265 or VP9, read as the images that they show.
 
 A picture needs those before it, back to one that needs none. Packets from one such to the next are decoded together,
-by the FFmpeg within OpenCV. The video of Foxglove and of `ffmpeg_image_transport` is read.
+by the FFmpeg within OpenCV, with the parameters of the stream that came last. H.265 may begin with a picture that needs
+none (CRA) while some after it need pictures before it: then these are decoded too. The video of Foxglove and of
+`ffmpeg_image_transport` is read.
 """
 
 from __future__ import annotations
@@ -21,8 +23,13 @@ from duagc.converters.logs.entries import Entry
 
 _CODECS = {"264": "h264", "265": "h265", "hevc": "h265", "vp9": "vp9"}
 """By what the name of a format or of an encoder holds ("h264", "libx264", "hevc_nvenc")."""
+_START = b"\x00\x00\x01"
 _KEY_UNITS = {"h264": range(5, 6), "h265": range(16, 22)}
 """Types of the units (NAL) of pictures that need no other."""
+_PARAMETER_UNITS = {"h264": range(7, 9), "h265": range(32, 35)}
+"""Of what a decoder must know of the stream; some encoders send it once."""
+_SKIPPED_UNITS = {"h264": range(0), "h265": range(8, 10)}
+"""Of pictures that need some before the last one that needs none (RASL)."""
 
 
 def is_video(kind: str) -> bool:
@@ -39,19 +46,34 @@ def images(packets: Iterator[Entry]) -> Iterator[Entry]:
         packets: messages that `is_video`, of one topic, in order of recording.
     """
     part: list[Entry] = []
+    before: list[Entry] = []
+    parameters = b""
     for packet in packets:
         if _begins(packet):
-            yield from _Part(part).entries()
-            part = []
+            yield from _Part(part, before, parameters).entries()
+            parameters = b"".join(_parameters(p) for p in part) or parameters
+            part, before = [], part
         part.append(packet)
-    yield from _Part(part).entries()
+    yield from _Part(part, before, parameters).entries()
 
 
 class _Part:
     """Packets from a picture that needs no other to the next such; decoded in turn, and again for an earlier one."""
 
-    def __init__(self, packets: Sequence[Entry]) -> None:
-        self._packets = packets
+    def __init__(self, packets: Sequence[Entry], before: Sequence[Entry] = (), parameters: bytes = b"") -> None:
+        """Nothing is decoded.
+
+        Args:
+            packets: of the part.
+            before: those of the part before it.
+            parameters: of the stream, as they came last before the part.
+        """
+        self._packets, self._parameters = packets, parameters
+        skipped = [_is_skipped(packet) for packet in packets]
+        lead = [packet for packet in before if not _is_skipped(packet)] if any(skipped) else []
+        left = [k for k, late in enumerate(skipped) if lead or not late]
+        self._decoded = [*lead, *(packets[k] for k in left)]
+        self._number = {k: len(lead) + n for n, k in enumerate(left)}  # among those that are decoded
         self._film: Any = None
         self._next = 0
         self._picture: NDArray[np.uint8] | None = None
@@ -64,9 +86,11 @@ class _Part:
     def _read(self, index: int) -> Fields:
         """The image of a packet."""
         packet = self._packets[index].read()
-        picture = None if self._fault else self._shown(self._places[index])
+        number = self._number.get(index)
+        picture = None if self._fault or number is None else self._shown(self._places[number])
         if picture is None:
-            why = self._fault or "of which a picture cannot be decoded"
+            missing = "that needs pictures before the first one that needs none"
+            why = self._fault or (missing if number is None else "of which a picture cannot be decoded")
             return Fields(header=packet.header, format=f"{_name(packet)} {why}", data=bytes(packet.data))
         height, width = picture.shape[:2]
         return Fields(
@@ -82,22 +106,21 @@ class _Part:
     @cached_property
     def _fault(self) -> str:
         """Why the packets have no images; empty if they have."""
-        first = self._packets[0].read()
-        if _codec(first) is None:
+        if _codec(self._packets[0].read()) is None:
             return "that is not read"
-        if not _begins(self._packets[0]):
+        if not self._decoded or not _begins(self._decoded[0]):
             return "before the first picture that needs no other"
         film, count = self._opened(), 0
         while film.isOpened() and film.grab():
             count += 1
-        found, wanted = f"{count} pictures", f"{len(self._packets)} packets"
-        return "" if count == len(self._packets) else f"with {found} in {wanted}"
+        found, wanted = f"{count} pictures", f"{len(self._decoded)} packets"
+        return "" if count == len(self._decoded) else f"with {found} in {wanted}"
 
     @cached_property
     def _places(self) -> dict[int, int]:
-        """Which picture each packet shows: they are shown in order of time, whatever needs which."""
-        in_time = sorted(range(len(self._packets)), key=lambda k: self._packets[k].header_ns())
-        return {index: place for place, index in enumerate(in_time)}
+        """Which picture each decoded packet shows: they are shown in order of time, whatever needs which."""
+        in_time = sorted(range(len(self._decoded)), key=lambda k: self._decoded[k].header_ns())
+        return {number: place for place, number in enumerate(in_time)}
 
     def _shown(self, place: int) -> NDArray[np.uint8] | None:
         """Colors [h, w, 3] (BGR) of a picture; None if it cannot be decoded."""
@@ -118,10 +141,10 @@ class _Part:
     @cached_property
     def _content(self) -> bytes:
         """The packets as a file: H.264 and H.265 one after another, VP9 in an IVF."""
-        packets = [packet.read() for packet in self._packets]
+        packets = [packet.read() for packet in self._decoded]
         found = [bytes(packet.data) for packet in packets]
         if _codec(packets[0]) != "vp9":
-            return b"".join(found)
+            return b"".join(found if _parameters(self._decoded[0]) else [self._parameters, *found])
         numbers = struct.pack("<HHIII", 0, 0, 30, 1, len(found))  # size and rate, which nobody reads
         head = b"DKIF" + struct.pack("<HH", 0, 32) + b"VP90" + numbers + bytes(4)
         return head + b"".join(struct.pack("<IQ", len(data), k) + data for k, data in enumerate(found))
@@ -135,13 +158,36 @@ def _begins(entry: Entry) -> bool:
         return False
     if codec == "vp9":  # bits: 10, profile, shows an old picture, needs others
         return bool(data) and data[0] >> 6 == 2 and not data[0] & 0b1100
+    return any(kind in _KEY_UNITS[codec] for kind, _ in _units(codec, data))
+
+
+def _is_skipped(entry: Entry) -> bool:
+    """Whether a packet holds a picture that cannot be shown if decoding begins with its part."""
+    packet = entry.read()
+    codec = _codec(packet)
+    return codec in _SKIPPED_UNITS and any(
+        kind in _SKIPPED_UNITS[codec] for kind, _ in _units(codec, bytes(packet.data))
+    )
+
+
+def _parameters(entry: Entry) -> bytes:
+    """What a packet says of the stream; empty: nothing, or in every picture that needs no other."""
+    packet = entry.read()
+    codec = _codec(packet)
+    if codec not in _PARAMETER_UNITS:
+        return b""
+    units = _units(codec, bytes(packet.data))
+    return b"".join(unit for kind, unit in units if kind in _PARAMETER_UNITS[codec])
+
+
+def _units(codec: str, data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Types of the units (NAL) of a packet of H.264 or H.265, and their bytes with the code that begins them."""
     shift, mask = (0, 31) if codec == "h264" else (1, 63)
-    at = data.find(b"\x00\x00\x01")
-    while 0 <= at < len(data) - 3:
-        if data[at + 3] >> shift & mask in _KEY_UNITS[codec]:
-            return True
-        at = data.find(b"\x00\x00\x01", at + 3)
-    return False
+    at = data.find(_START)
+    while 0 <= at < len(data) - len(_START):
+        after = data.find(_START, at + len(_START))
+        yield data[at + len(_START)] >> shift & mask, data[at : after if after >= 0 else len(data)]
+        at = after
 
 
 def _name(packet: Any) -> str:

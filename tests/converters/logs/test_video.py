@@ -199,6 +199,37 @@ def test_vp9(tmp_path: Path, film: list[NDArray[np.uint8]]) -> None:
     assert min(wrong) > 1.5 * errors[0]
 
 
+def test_parameters_of_the_stream_may_come_once(film: list[NDArray[np.uint8]]) -> None:
+    planes = [planes_of(image) for image in film]
+    whole = packets(planes, 2)
+    start = b"\x00\x00\x00\x01"
+    units = [[start + unit for unit in data.split(start)[1:]] for data in whole]
+    assert all([unit[4] & 31 for unit in found[:-1]] == [7, 8] for found in units[::2])
+    once = [whole[0], *(found[-1] for found in units[1:])]
+    for first in (0, 3):  # whatever begins a topic is not read for want of them, what follows is
+        found = list(images(iter(entries_of(once[first:]))))
+        assert [is_unusable(entry.read()) for entry in found] == [first > 0] * len(found)
+    found = list(images(iter(entries_of(once))))
+    for index in (6, 0, 3, 5):
+        assert np.abs(picture(found[index].read()) - shown(planes[index])).max() <= NEAR, index
+
+
+def test_h265_pictures_may_need_some_before_the_one_that_needs_none(film: list[NDArray[np.uint8]]) -> None:
+    planes = [planes_of(image) for image in (*film, *film[::-1])]
+    coded = h265_packets.open_packets(planes, 4)
+    assert [place for place, _ in coded] == [0, 1, 2, 3, 5, 4, 6, 7, 9, 8, 10, 11, 13, 12]
+    data, order = [data for _, data in coded], [place for place, _ in coded]
+    found = list(images(iter(entries_of(data, "hevc", order))))
+    for index in (0, 5, 4, 13, 9, 8, 1):
+        assert np.abs(picture(found[index].read()) - shown(planes[order[index]])).max() <= NEAR, index
+    late = list(images(iter(entries_of(data[4:], "hevc", order[4:]))))  # 4 needs what is not there
+    assert [is_unusable(entry.read()) for entry in late] == [False, True, *[False] * 8]
+    assert late[1].read().format == "hevc that needs pictures before the first one that needs none"
+    for index in (0, 2, 4, 5):
+        shows = order[4 + index]
+        assert np.abs(picture(late[index].read()) - shown(planes[shows])).max() <= NEAR, index
+
+
 def test_h265_may_begin_with_a_picture_that_others_may_follow_into() -> None:
     """Which units begin a part; not all of them stand here as a decoder wants them."""
     units = {"parameters": 32, "clean": 21, "part": 1}
