@@ -9,7 +9,7 @@ without, with extrinsics from the log's constant transforms or given ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from duagc.converters.logs.derived import Picture, Sweeps
 from duagc.converters.logs.describe import namespaces
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
-from duagc.converters.logs.sources import Source, pieces_words, sources_of, unread
+from duagc.converters.logs.sources import Source, piece_before, pieces_words, sources_of, unread
 from duagc.converters.logs.unmeasured import first_depths, float_unit_m
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter
@@ -83,7 +83,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         robot_logs = {}
         for part in sources:
             log = opened.enter_context(open_log(part.paths, part.name))
-            robot_logs[part.robot] = _robot_log(log, part)
+            robot_logs[part.robot] = _robot_log(log, part, sources)
         spans = {robot: (min(found.pairs), max(found.pairs)) for robot, found in robot_logs.items()}
         if src.suffix != ".toml" and (words := pieces_words(sources, spans)):
             raise DuagError(f"{src}: {words}")
@@ -93,15 +93,19 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
             write_robot(recording, part.robot, robot_logs[part.robot], part.label)
 
 
-def _robot_log(log: Log, part: Source) -> RobotLog:
-    """The log of one robot; where topics of several cannot be separated, the error says how."""
+def _robot_log(log: Log, part: Source, sources: Sequence[Source]) -> RobotLog:
+    """The log of one robot; where it is not that of one, the error says what to do."""
+    if not (part.namespace or part.settings.color) and (spaces := namespaces(log)):
+        raise DuagError(
+            f"{log.name}: found color and depth below {', '.join(spaces)}, expected --set "
+            f"namespaces={','.join(spaces)} if each is a robot, namespaces={spaces[0]} for one, or color=TOPIC"
+        )
     try:
         return RobotLog(log, part.namespace, part.settings)
     except DuagError as error:
-        spaces = [] if part.namespace else namespaces(log)
-        if not spaces:
+        if piece_before(part, sources) is None:
             raise
-        raise DuagError(f"{error}, or --set namespaces={','.join(spaces)} if each is a robot") from error
+        raise DuagError(f"{error}, or --set pieces=true if these are pieces of one log") from error
 
 
 def _world_warnings(robot_logs: Mapping[str, RobotLog]) -> list[str]:

@@ -104,13 +104,26 @@ def is_depth(message: Any) -> bool:
     """Whether an Image or CompressedImage holds depth, by what it says of itself."""
     if hasattr(message, "encoding"):
         return message.encoding in DEPTH_ENCODINGS
-    return "compressedDepth" in message.format or _is_gray_png_of_16_bits(bytes(message.data[:26]))
+    head = bytes(message.data[:26])
+    whole = _is_gray_png_of_16_bits(head) or (
+        _is_tiff(head) and _encoding(message.format) in DEPTH_ENCODINGS[:2]
+    )
+    return "compressedDepth" in message.format or whole
 
 
 def is_integer_depth(message: Any) -> bool:
     """Whether depth comes as integers, whose numbers can be kept; else as floats."""
-    encoding = message.encoding if hasattr(message, "encoding") else message.format.split(";")[0].strip()
+    encoding = message.encoding if hasattr(message, "encoding") else _encoding(message.format)
     return bool(encoding != "32FC1")
+
+
+def _encoding(text: str) -> str:
+    """What the format of a compressed image says of its pixels: "16UC1; png compressed" is "16UC1"."""
+    return text.split(";")[0].strip()
+
+
+def _is_tiff(head: bytes) -> bool:
+    return head.startswith((b"II*\0", b"MM\0*"))
 
 
 def _is_gray_png_of_16_bits(head: bytes) -> bool:
@@ -156,7 +169,7 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
 
     if hasattr(message, "format"):
         data = _whole(message, where)
-        pattern = message.format.split(";")[0].strip()
+        pattern = _encoding(message.format)
         if pattern.startswith("bayer_") and (colors := _bayer_as_png(data, pattern, where)) is not None:
             return colors, "png"
         if data.startswith(b"\xff\xd8\xff"):
@@ -185,7 +198,7 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
 def _whole(message: Any, where: str) -> bytes:
     """The data of a CompressedImage that has its end."""
     if is_cut_short(message):
-        pattern = message.format.split(";")[0].strip()
+        pattern = _encoding(message.format)
         raise UnusableImage(
             f"{where}: {len(message.data)} bytes of {pattern}, expected an image that has its end"
         )
@@ -259,7 +272,7 @@ def _sound(depth: NDArray[Any]) -> Depth:
 
 
 def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] | Depth:
-    """compressedDepth of image_transport: a header of 12 bytes, then PNG or RVL; plain PNG too.
+    """compressedDepth of image_transport: a header of 12 bytes, then PNG or RVL; plain PNG and TIFF too.
 
     A PNG of 32FC1 holds inverse depth, z = A / (v - B); the encoding in `format` decides, not the header.
     """
@@ -267,18 +280,18 @@ def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] 
 
     if data.startswith(b"\xff\xd8\xff"):
         raise DuagError(f"{where}: depth as JPEG, expected 16-bit depth; eight bits of it are lost")
-    plain = data.startswith(b"\x89PNG")
+    plain = data.startswith(b"\x89PNG") or _is_tiff(data)
     if not plain and len(data) < 12:
         raise UnusableImage(f"{where}: {len(data)} bytes, expected compressed depth")
     body = data if plain else data[12:]
-    encoding = text.split(";")[0].strip()
-    if not body.startswith(b"\x89PNG"):
+    encoding = _encoding(text)
+    if not plain and not body.startswith(b"\x89PNG"):
         values = _rvl(body, where)
     else:
         image = decode_image(body, cv2.IMREAD_UNCHANGED)
         if image is None or image.dtype != np.uint16 or image.ndim != 2:
             kind = UnusableImage if image is None else DuagError
-            raise kind(f"{where}: no decoder finds 16-bit depth in it, expected a PNG of 16 bits")
+            raise kind(f"{where}: no decoder finds 16-bit depth in it, expected a PNG or TIFF of 16 bits")
         values = image.astype(np.uint16)
     if encoding != "32FC1":
         return without_saturated(values)

@@ -23,7 +23,15 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording.names import DEPTH_SCALE_KEY
 from duagc.schemas import topics
 
-RECTIFIED = ("image_rect", "image_rect_color", "rect")
+RECTIFIED = (
+    "rect"  # how a word begins in the name of images that are: image_rect_color, image_color_rect, rectified
+)
+TRANSPORTS = (
+    "compressed",
+    "compressedDepth",
+    "ffmpeg",
+    "foxglove",
+)  # last parts of topics, below those of images
 SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
 
 
@@ -107,8 +115,9 @@ def is_rectified(topic: str, own: bool = False) -> bool:
         topic: of the images.
         own: whether DUAG-C wrote the log.
     """
-    name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
-    return name.startswith(RECTIFIED) or is_own_depth(topic, own)
+    path = PurePosixPath(topic)
+    words = (path.parent if path.name in TRANSPORTS else path).name.split("_")
+    return any(word.startswith(RECTIFIED) for word in words) or is_own_depth(topic, own)
 
 
 def is_own_depth(topic: str, own: bool) -> bool:

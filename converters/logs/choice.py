@@ -108,7 +108,7 @@ class Chooser:
             return self._one("depth", self.clouds, (), "point", known=self.clouds)
         found = [t for t, m in self.images.items() if is_depth(m)]
         sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
-        choice = self._one("depth", self._preferred(sure or found), REGISTERED)
+        choice = self._one("depth", self._near_color(self._preferred(sure or found)), REGISTERED)
         lost = [t for t, m in self.images.items() if self._is_named_depth(t) and not is_depth(m)]
         if not choice.topic and not choice.candidates and self.clouds:
             choice = replace(choice, why=f"{choice.why}, but there are points (depth_from=lidar)")
@@ -126,6 +126,12 @@ class Chooser:
         return replace(
             choice, why=f"{choice.why}; {', '.join(lost)} holds no depth, or as JPEG, which destroys it"
         )
+
+    def _near_color(self, topics: Sequence[str]) -> Sequence[str]:
+        """Topics whose names share most with that of color: of several cameras each has its own depth."""
+        color = self.color().topic
+        shared = [shared_parts(color, topic) for topic in topics]
+        return [topic for topic, count in zip(topics, shared, strict=True) if count == max(shared)]
 
     def info(self, option: str, image_topic: str) -> Choice:
         """CameraInfo of an image topic: the one whose name shares most with it."""

@@ -97,15 +97,10 @@ def _robots(src: Path) -> Iterator[tuple[Source, str]]:
 
 
 def namespaces(log: Log) -> list[str]:
-    """Namespaces of a log that each have color and depth, if that is what keeps from choosing; else none."""
-    chooser = Chooser(log)
-    if chooser.color().topic and chooser.depth().topic:
-        return []
-    spaces = []
-    for name in sorted({f"/{topic.lstrip('/').split('/')[0]}" for topic in chooser.images}):
-        inner = Chooser(log, name)
-        if inner.color().topic and inner.depth().topic:
-            spaces.append(name)
+    """Namespaces of a log, if it has several that each have color and depth; else none."""
+    names = sorted({f"/{topic.lstrip('/').split('/')[0]}" for topic in Chooser(log).images})
+    inner = {name: Chooser(log, name) for name in names} if len(names) > 1 else {}
+    spaces = [name for name, of in inner.items() if of.color().topic and of.depth().topic]
     return spaces if len(spaces) > 1 else []
 
 

@@ -114,14 +114,15 @@ def extrinsics(
         DuagError: nothing says where the depth camera is, or registered depth has another size than color.
     """
     s, a, b = settings, color.camera.camera, depth.camera.camera
+    of_one_size = (a.width, a.height) == (b.width, b.height)
+    if s.registered == "yes" and not of_one_size:
+        raise DuagError(
+            f"{log.name}: {depth.topic} is {b.width}x{b.height}, expected {a.width}x{a.height} of color that it "
+            "is registered to, or registered=no"
+        )
     if s.registered == "yes" or (
-        s.registered == "auto" and not s.T_color_depth and _is_registered(color, depth)
+        s.registered == "auto" and not s.T_color_depth and of_one_size and _is_registered(color, depth)
     ):
-        if (a.width, a.height) != (b.width, b.height):
-            raise DuagError(
-                f"{log.name}: {depth.topic} is {b.width}x{b.height}, expected {a.width}x{a.height} of color that it "
-                "is registered to"
-            )
         return None
     if s.T_color_depth:
         return extrinsics_of("T_color_depth", s.T_color_depth)

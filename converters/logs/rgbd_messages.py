@@ -1,7 +1,8 @@
 """Messages that hold color, depth and their cameras at once, read as four topics.
 
 RealSense's driver sends them (`enable_rgbd`), and RTAB-Map. Those of `/camera/rgbd` are read as /camera/rgbd/rgb/image,
-/camera/rgbd/rgb/camera_info, and the same of depth; images that they hold compressed as .../image/compressed.
+/camera/rgbd/rgb/camera_info, and the same of depth; images that they hold compressed as .../image/compressed. RTAB-Map
+takes images for rectified, so its are image_rect.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from duagc.pipeline.base.files import decode_image
 RGBA = b"\x08\x06"  # 8 bits, color type 6, in the first chunk of a PNG
 _TYPES = ("realsense2_camera_msgs/msg/RGBD", "rtabmap_msgs/msg/RGBDImage", "rtabmap_ros/msg/RGBDImage")
 _MEMBERS = {  # of the messages, by the topics that they are read as
-    "rgb/image": "rgb",
-    "rgb/image/compressed": "rgb_compressed",
+    "rgb/{image}": "rgb",
+    "rgb/{image}/compressed": "rgb_compressed",
     "rgb/camera_info": "rgb_camera_info",
-    "depth/image": "depth",
-    "depth/image/compressed": "depth_compressed",
+    "depth/{image}": "depth",
+    "depth/{image}/compressed": "depth_compressed",
     "depth/camera_info": "depth_camera_info",
 }
 
@@ -60,9 +61,10 @@ class _WithMembers:
     def _add(self, topic: LogTopic) -> None:
         """Make the topics of the members known."""
         message = next(iter(self._part.entries([topic.name]))).read()
+        image = "image" if topic.type == _TYPES[0] else "image_rect"
         for name, member in _MEMBERS.items():
             value = getattr(message, member, None)
-            added = f"{topic.name}/{name}"
+            added = f"{topic.name}/{name.format(image=image)}"
             if value is not None and len(getattr(value, "data", "1")) and added not in self.topics:
                 self._source[added] = topic.name, member
                 self.topics[added] = replace(topic, name=added, type=value.__msgtype__)

@@ -29,6 +29,7 @@ from duagc.schemas import topics
 NAMESPACE = "{namespace}"  # stands for that of each robot in the names of topics
 TOPICS = ("color", "depth", "color_info", "depth_info", "imu", "odometry", "truth", "truth_file")
 PIECES_NS = 5 * NANOSECONDS  # between the pieces of one log
+DATE = re.compile(r"\d{4}(-\d\d){5}")
 REMEDIES = {  # by how names of files end that hold a log: why it is not read
     ".bag.active": "was not closed (`rosbag reindex` mends it, then name it .bag)",
     ".db3.zstd": "is compressed (`zstd -d` unpacks it)",
@@ -232,23 +233,40 @@ def pieces_words(sources: Sequence[Source], spans_ns: Mapping[str, tuple[int, in
         sources: of all robots.
         spans_ns: first and last time of the images, by robot, of those that are known.
     """
-    numbered = {}
-    for source in sources:
-        match = re.fullmatch(r"(.+)_(\d+)", source.paths[0].stem)
-        if match and len(source.paths) == 1 and source.robot in spans_ns and not source.namespace:
-            numbered[match[1], int(match[2])] = source
-    for (stem, number), source in numbered.items():
-        after = numbered.get((stem, number + 1))
-        if after is None:
+    for after in sources:
+        before = piece_before(after, sources)
+        if before is None or not {before.robot, after.robot} <= spans_ns.keys():
             continue
-        between_ns = spans_ns[after.robot][0] - spans_ns[source.robot][1]
+        between_ns = spans_ns[after.robot][0] - spans_ns[before.robot][1]
         if 0 < between_ns < PIECES_NS:
             return (
                 f"{after.paths[0].name} begins {between_ns / NANOSECONDS:.3f} s after the end of "
-                f"{source.paths[0].name}, as pieces of one log do; expected --set pieces=true, or a TOML file "
+                f"{before.paths[0].name}, as pieces of one log do; expected --set pieces=true, or a TOML file "
                 "that says which robots they are"
             )
     return ""
+
+
+def piece_before(source: Source, sources: Sequence[Source]) -> Source | None:
+    """Whose log one continues, if they are pieces of one, by their names: run_1 follows run_0; None: nobody's.
+
+    Args:
+        source: of a robot.
+        sources: of all robots.
+    """
+    stem, number = _numbered(source)
+    return next((s for s in sources if number > 0 and _numbered(s) == (stem, number - 1)), None)
+
+
+def _numbered(source: Source) -> tuple[str, int]:
+    """Name and number of a log that may be a piece, from 0; -1: it is none.
+
+    `rosbag record --split` writes the date of each piece before its number.
+    """
+    match = re.fullmatch(r"(.*)_(\d+)", DATE.sub("", source.paths[0].stem))
+    if match is None or len(source.paths) > 1 or source.namespace:
+        return source.paths[0].stem, -1
+    return match[1], int(match[2])
 
 
 def is_log(path: Path) -> bool:

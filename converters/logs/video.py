@@ -60,7 +60,9 @@ def images(packets: Iterator[Entry]) -> Iterator[Entry]:
 class _Part:
     """Packets from a picture that needs no other to the next such; decoded in turn, and again for an earlier one."""
 
-    def __init__(self, packets: Sequence[Entry], before: Sequence[Entry] = (), parameters: bytes = b"") -> None:
+    def __init__(
+        self, packets: Sequence[Entry], before: Sequence[Entry] = (), parameters: bytes = b""
+    ) -> None:
         """Nothing is decoded.
 
         Args:

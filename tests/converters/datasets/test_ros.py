@@ -68,7 +68,9 @@ def test_two_robots_in_one_bag_and_in_two(tmp_path: Path) -> None:
         scene(r, prefix="/jackal") + scene(r, prefix="/husky", poses=path(FRAMES, 0.2)), key=lambda x: x[1]
     )
     bag = r.write(tmp_path / "one", both, "mcap")
-    with pytest.raises(DuagError, match=r"=TOPIC, or --set namespaces=/husky,/jackal if each is a robot$"):
+    with pytest.raises(
+        DuagError, match=r"below /husky, /jackal, expected --set namespaces=/husky,/jackal if each"
+    ):
         registry.convert("ros", bag, tmp_path / "rec")
     registry.convert("ros", bag, tmp_path / "rec", options=["namespaces=/husky,/jackal"])
     (tmp_path / "two").mkdir()

@@ -20,7 +20,7 @@ from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.recording.read import LogFile
-from tests.fixtures.ros_bags import SMALL, START_NS, Ros, still
+from tests.fixtures.ros_bags import SMALL, START_NS, STEP_NS, Ros, still
 
 COLOR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame"
 LENS = (0.3, -0.2, 0.0, 0.0, 0.0)
@@ -133,6 +133,36 @@ def test_unregistered_depth_is_not_chosen_for_its_name(tmp_path: Path) -> None:
         choice = Chooser(log).depth()
     assert choice.topic == ""
     assert len(choice.candidates) == 2
+
+
+def test_each_camera_has_its_own_depth(tmp_path: Path) -> None:
+    """A ZED in front and a RealSense on the arm, whose words are before those of the ZED where depth is chosen."""
+    r = Ros(2)
+    front = ("/robot/zed/rgb/image_rect_color", "z"), ("/robot/zed/depth/depth_registered", "z")
+    arm = ("/robot/arm/color/image_raw", "a"), ("/robot/arm/aligned_depth_to_color/image_raw", "a")
+    rows = sorted(still(r, *front) + still(r, *arm), key=lambda row: row[1])
+    with open_log([r.write(tmp_path / "bag", rows, "sqlite3")]) as log:
+        assert Chooser(log).color().topic == front[0][0]
+        assert Chooser(log).depth().topic == front[1][0]
+        assert Chooser(log, wanted={"color": arm[0][0]}).depth().topic == arm[1][0]
+
+
+def test_depth_of_another_size_in_the_frame_of_color_is_registered_to_it(tmp_path: Path) -> None:
+    r, half = Ros(2), PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
+    topics = "/camera/rgb/image_raw", "/camera/depth_registered/image_raw"
+    rows = [row for row in still(r, (topics[0], "c")) if "depth" not in row[0]]
+    rows.append(("/camera/depth_registered/camera_info", START_NS, r.info(START_NS, "c", half)))
+    for k in range(3):
+        at = START_NS + (k + 1) * STEP_NS
+        rows.append((topics[1], at, r.image(at, "c", np.full((24, 32), 1500, np.uint16), "16UC1")))
+    bag = r.write(tmp_path / "bag", sorted(rows, key=lambda row: row[1]), "sqlite3")
+    registry.convert("ros", bag, tmp_path / "rec")
+    assert described(tmp_path / "rec")["robots"]["alpha"]["sensors"]["depth"].endswith("by the converter")
+    depth = first(tmp_path / "rec")[0]
+    assert depth.shape == (SMALL.height, SMALL.width)
+    assert (np.abs(depth - 1.5) < 1e-3).mean() > 0.9
+    with pytest.raises(DuagError, match=r"is 32x24, expected 64x48 of color .*, or registered=no"):
+        registry.convert("ros", bag, tmp_path / "rec2", options=["registered=yes"])
 
 
 @pytest.mark.parametrize(

@@ -168,6 +168,7 @@ def test_compressed_depth() -> None:
         ("16UC1; compressedDepth", head + png),
         ("16UC1; compressedDepth rvl", head + rvl(raw)),
         ("16UC1; compressedDepth png", png),
+        ("16UC1; tiff compressed", cv2.imencode(".tif", raw)[1].tobytes()),
     ):
         got = ros_images.depth_m(r.compressed(1, "d", data, text), "here", 0.001)
         assert np.array_equal(got, raw.astype(np.float32) * np.float32(0.001)), text

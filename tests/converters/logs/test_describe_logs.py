@@ -19,7 +19,7 @@ from duagc.pipeline.recording import read_log
 from tests.fixtures.box_room import path
 from tests.fixtures.foreign_mcap import digests, write
 from tests.fixtures.kimera_multi import imu
-from tests.fixtures.ros_bags import FRAMES, REAL, START_NS, Ros, scene
+from tests.fixtures.ros_bags import FRAMES, REAL, START_NS, Ros, scene, still
 from tests.fixtures.ros_clocks import both
 
 run = CliRunner()
@@ -90,6 +90,26 @@ def test_namespaces_that_decide_become_robots(tmp_path: Path) -> None:
     assert list(robots) == ["husky", "jackal"]
     same = describe.describe(tmp_path / "team.toml")["robots"]
     assert [row["namespace"] for row in same.values()] == ["/husky", "/jackal"]
+
+
+def test_robots_with_unlike_cameras_are_several(tmp_path: Path) -> None:
+    """Words of one robot's topics would decide for it, and the other would be left out."""
+    r = Ros(2)
+    realsense = (
+        ("/jackal/camera/color/image_raw", "c"),
+        ("/jackal/camera/aligned_depth_to_color/image_raw", "c"),
+    )
+    openni = ("/husky/camera/rgb/image_raw", "c"), ("/husky/camera/depth_registered/image_raw", "c")
+    rows = sorted(still(r, *realsense) + still(r, *openni), key=lambda row: row[1])
+    bag = r.write(tmp_path / "bag", rows, "mcap")
+    assert sorted(describe.describe(bag)["robots"]) == ["husky", "jackal"]
+    with pytest.raises(
+        DuagError, match=r"below /husky, /jackal, expected --set namespaces=/husky,/jackal if each"
+    ):
+        registry.convert("ros", bag, tmp_path / "rec")
+    registry.convert("ros", bag, tmp_path / "rec", options=["color=/husky/camera/rgb/image_raw"])
+    content = json.loads((tmp_path / "rec" / "recording.json").read_text())
+    assert content["robots"]["alpha"]["sensors"]["depth_topic"] == openni[1][0]
 
 
 def test_a_topic_that_is_said_is_of_one_robot(tmp_path: Path) -> None:

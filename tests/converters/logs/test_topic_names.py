@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from duagc.converters import registry
+from duagc.converters.logs.cameras import is_rectified
 from duagc.converters.logs.files import is_below
 from duagc.pipeline.recording import info
 from tests.fixtures.ros_bags import Ros, still
@@ -30,3 +33,21 @@ def test_a_namespace_is_no_beginning_of_a_word() -> None:
     assert is_below("jackal/color", "/jackal/")
     assert not is_below("/jackal2/color", "/jackal")
     assert is_below("/color", "")
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/camera/rgb/image_rect_color", True),
+        ("/camera/rgb/image_rect_color/ffmpeg", True),
+        ("/camera/depth/image_rect_raw/compressedDepth", True),
+        ("/kinect2/qhd/image_color_rect/compressed", True),
+        ("/camera/left_rectified", True),
+        ("/camera/rgb/image_raw", False),
+        ("/camera/rgb/image_raw/compressed", False),
+        ("/image_rect/raw", False),
+        ("/camera/correct", False),
+    ],
+)
+def test_names_of_rectified_images(topic: str, rectified: bool) -> None:
+    assert is_rectified(topic) == rectified

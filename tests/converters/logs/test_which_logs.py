@@ -15,7 +15,7 @@ from duagc.converters.logs.describe import describe
 from duagc.converters.logs.sources import sources_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import info
-from tests.fixtures.ros_bags import START_NS, Ros, still
+from tests.fixtures.ros_bags import START_NS, Ros, scene, still
 from tests.fixtures.ros_clocks import moved_headers
 
 
@@ -59,22 +59,45 @@ def test_a_folder_in_a_bag_of_ros_2_is_not_part_of_it(tmp_path: Path) -> None:
     registry.convert("ros", bag, bag / "rec2")
 
 
-@pytest.mark.parametrize(("gap_ns", "is_one"), [(50_000_000, True), (60_000_000_000, False)])
-def test_pieces_of_a_bag_that_lost_its_metadata(tmp_path: Path, gap_ns: int, is_one: bool) -> None:
-    """As a crash of `ros2 bag` leaves them. Sessions a minute apart may be robots."""
+@pytest.mark.parametrize(
+    ("names", "gap_ns", "is_one"),
+    [
+        (("split_0", "split_1"), 50_000_000, True),
+        (("split_0", "split_1"), 60_000_000_000, False),
+        (("split_1", "split_3"), 50_000_000, False),
+        (("a_2026-01-01-10-00-00_0", "a_2026-01-01-10-00-09_1"), 50_000_000, True),
+        (("2026-01-01-10-00-00_0", "2026-01-01-10-00-09_1"), 50_000_000, True),
+    ],
+)
+def test_pieces_of_a_log(tmp_path: Path, names: tuple[str, str], gap_ns: int, is_one: bool) -> None:
+    """As a crash of `ros2 bag` leaves them, or `rosbag record --split`. Sessions a minute apart may be robots."""
     r, logs = Ros(1), tmp_path / "split"
     logs.mkdir()
-    for k in range(2):
-        r.write(logs / f"split_{k}", later(r, still(r), k * (3 * 50_000_000 + gap_ns)), "plain")
+    for k, name in enumerate(names):
+        r.write(logs / name, later(r, still(r), k * (3 * 50_000_000 + gap_ns)), "plain")
     if not is_one:
         registry.convert("ros", logs, tmp_path / "rec")
         return
-    words = r"split_1.bag begins 0.050 s after the end of split_0.bag, .*--set pieces=true"
+    words = rf"{names[1]}.bag begins 0.050 s after the end of {names[0]}.bag, .*--set pieces=true"
     with pytest.raises(DuagError, match=words):
         registry.convert("ros", logs, tmp_path / "rec")
-    assert any("split_1.bag begins" in text for text in describe(logs)["warnings"])
+    assert any(f"{names[1]}.bag begins" in text for text in describe(logs)["warnings"])
     registry.convert("ros", logs, tmp_path / "rec", options=["pieces=true"])
     assert info(tmp_path / "rec")["robots"]["alpha"]["frames"] == 8
+
+
+def test_what_only_the_first_piece_says_is_missed_in_the_next(tmp_path: Path) -> None:
+    r, logs = Ros(1), tmp_path / "split"
+    logs.mkdir()
+    whole = scene(r)
+    later_rows = [row for row in later(r, whole, 4 * 50_000_000) if row[0] != "/tf_static"]
+    for k, rows in enumerate((whole, later_rows)):
+        r.write(logs / f"split_{k}", rows, "plain")
+    with pytest.raises(
+        DuagError, match=r"split_1.bag: .* does not tie them.*, or --set pieces=true if these are"
+    ):
+        registry.convert("ros", logs, tmp_path / "rec")
+    registry.convert("ros", logs, tmp_path / "rec", options=["pieces=true"])
 
 
 @pytest.mark.parametrize(
