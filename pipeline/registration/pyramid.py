@@ -19,6 +19,7 @@ from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
 from duagc.pipeline.kernels import pyramid as compiled
+from duagc.pipeline.registration.scattered_holes import without_scattered_holes
 
 Image = NDArray[Any]
 
@@ -153,7 +154,8 @@ class RgbdPyramid:
 
         Args:
             image: color [h, w, 3], float 0..1 or uint8, or gray [h, w], 0..1.
-            depth_m: float32 [h, w], meters along z; 0, negative or not finite means unknown.
+            depth_m: float32 [h, w], meters along z; 0, negative or not finite means unknown. Scattered holes are
+                filled.
             camera: intrinsics of both images.
             levels: number of resolutions.
             depth_sigma_m: [h, w], meters; None: not known pixel by pixel.
@@ -164,6 +166,8 @@ class RgbdPyramid:
         if gray.shape != shape or depth_m.shape != shape:
             raise ValueError(f"images of {gray.shape} and {depth_m.shape}, camera of {shape}")
         inverse_depth, sigma = compiled.inverse_depth_of(depth_m, mask, depth_sigma_m)
+        if sigma is None:  # where it is known, holes are those of what was computed from images or sweeps
+            inverse_depth = without_scattered_holes(inverse_depth, mask)
         built = [Level(camera, gray, inverse_depth, depth_sigma_m=sigma, mask=mask)]
         while len(built) < levels:
             built.append(built[-1].halved())
