@@ -41,6 +41,14 @@ class NormalEquations:
         H, gradients = self.H[:known, :known], self.tile_gradients[:known]
         return max(1.0, excess(H, gradients @ gradients.T))
 
+    def moved(self, by: Array) -> NormalEquations:
+        """The same with the gradient at another pose, as the quadratic has it.
+
+        Args:
+            by: [8], from this one.
+        """
+        return replace(self, gradient=self.gradient + self.H @ by)
+
     def divided(self, factor: float) -> NormalEquations:
         """The same with all weights divided by a factor."""
         return replace(
@@ -89,6 +97,14 @@ class System:
     def normal_equations(self) -> tuple[Array, Array]:
         """H [8, 8] and gradient [8] of both kinds together."""
         return self.depth.H + self.gray.H, self.depth.gradient + self.gray.gradient
+
+    def moved(self, by: Array) -> System:
+        """The same with gradients at another pose, as the quadratic has it.
+
+        Args:
+            by: [8], from this one.
+        """
+        return replace(self, depth=self.depth.moved(by), gray=self.gray.moved(by))
 
     def by_correlation(self) -> System:
         """The same with the weights of either kind divided by its correlation."""

@@ -13,6 +13,7 @@ from duagc.pipeline.registration import (
     Registration,
     RegistrationConfig,
     RgbdPyramid,
+    linearize,
     register,
 )
 from duagc.pipeline.registration.align import reach_factor
@@ -376,3 +377,11 @@ def test_outdoors_what_is_weak_grows_with_the_distance():
     for limit_m, expected in ((0.8 * sigma_m, Outcome.OK), (0.5 / factor * sigma_m, Outcome.ILL_CONDITIONED)):
         config = RegistrationConfig(max_sigma_m=limit_m)
         assert register(samples, far[1], np.eye(4), config).outcome is expected
+
+
+def test_what_is_known_of_a_pair_does_not_depend_on_where_it_is_expanded(reference, end):
+    """Color and depth may disagree on the pose; how far the pose is from both says nothing of that."""
+    for off in (0.0, 0.01, 0.02, 0.04, 0.08):
+        found = linearize(reference, end, T_START_END @ se3.exp([off, 0, 0, 0, 0, 0]))
+        assert len(found.weak) == 0
+        assert found.overconfidence < 1.3  # 33 by the gradients at that place

@@ -34,7 +34,8 @@ def grid() -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("missing", "left"), [(scattered(0.1), 0.002), (scattered(0.3), 0.005), (scattered(0.6), 0.05), (grid(), 0.0)]
+    ("missing", "left"),
+    [(scattered(0.1), 0.002), (scattered(0.3), 0.005), (scattered(0.6), 0.05), (grid(), 0.0)],
 )
 def test_planes_are_filled_exactly(missing: np.ndarray, left: float) -> None:
     holes = np.where(missing, np.float32(0), plane())
