@@ -18,6 +18,9 @@ class MotionTimeConfig(Config):
     """Pairs that it needs: a log of a second does not tell it."""
     sigmas: float = Field(default=3.0, ge=0.0)
     """Times its standard deviation from which it is certain."""
+    most_sigma_s: float = Field(default=0.01, gt=0.0)
+    """Largest standard deviation with which it may be certain: at an even speed the noise of velocities may look like a
+    long time, with a standard deviation that is long too."""
     least_s: float = Field(default=0.01, ge=0.0)
     """Shorter ones are left: depth in coarse steps errs alike in near views, which may pass for some milliseconds."""
     cameras_m: float = Field(default=0.01, gt=0.0)

@@ -55,6 +55,9 @@ class FrozenImageDetector:
     no harm while the camera stands still. So each frozen image is compared with what the other one was when it came
     first: as soon as that has changed, the two no longer belong together. Drivers do that under load: RedKitchen
     repeats one depth image in fifty.
+
+    Attributes:
+        repeats: how many frames in a row, up to the last one, were the very ones before them, both images.
     """
 
     def __init__(self, config: FailureConfig) -> None:
@@ -65,6 +68,7 @@ class FrozenImageDetector:
         """
         self.config = config
         self._before: Level | None = None
+        self.repeats = 0
         # the other image, coarse, when each came first
         self._gray_then = self._inverse_depth_then = np.zeros((0, 0), dtype=np.float32)
 
@@ -78,6 +82,7 @@ class FrozenImageDetector:
         before, self._before = self._before, finest
         same_depth = before is not None and self._same(finest.inverse_depth, before.inverse_depth)
         same_color = before is not None and self._same(finest.gray, before.gray)
+        self.repeats = self.repeats + 1 if same_depth and same_color else 0
         if not same_depth:
             self._gray_then = _normalized(coarsest.gray)
         if not same_color:

@@ -62,12 +62,13 @@ class FoundTime:
         return abs(self.time_s) <= CHANCE_SIGMAS * self.sigma_s
 
     def is_certain(self, config: MotionTimeConfig) -> bool:
-        """Whether it is no chance, and long enough to matter.
+        """Whether it is well known, no chance, and long enough to matter.
 
         Args:
             config: of the estimate.
         """
-        return abs(self.time_s) >= max(config.least_s, config.sigmas * self.sigma_s)
+        is_known = self.sigma_s <= config.most_sigma_s
+        return is_known and abs(self.time_s) >= max(config.least_s, config.sigmas * self.sigma_s)
 
 
 @dataclass(frozen=True)

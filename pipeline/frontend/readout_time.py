@@ -101,9 +101,11 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
         left = left_of(found)
         certain = _certain(left, config)
         if any(certain):
-            found = _added(found, left, certain, longest_s)
+            first = found = _added(found, left, certain, longest_s)
             for _ in range(rounds - 1):
                 found = _added(found, left_of(found), certain, longest_s)
+            if min(first.color_s * found.color_s, first.depth_s * found.depth_s) < 0:
+                return Readout()  # what contradicts itself was chance
             return found if _moved(log, found, parts) >= config.least_move else Readout()
     return Readout()
 

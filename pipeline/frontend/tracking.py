@@ -36,6 +36,9 @@ from duagc.pipeline.recording.depth_sources import DepthImage
 from duagc.pipeline.recording.moved_depth import move_depth
 from duagc.pipeline.registration import Reference, Registration, RgbdPyramid
 
+MOST_REPEATS = 3
+"""Frames in a row that come again because a driver lost some; with more of them the camera stands still."""
+
 
 class Tracker:
     """Tracks one camera. Feed it the frames in order."""
@@ -245,10 +248,13 @@ class Tracker:
         )
 
     def _update_motion(self, frame: CurrentFrame, found: PoseCandidate) -> None:
-        """Pose and velocity, and the usual gray residual."""
+        """Pose and velocity, and the usual gray residual. A frame that comes again was taken when it came first."""
         state, result = self.state, found.result
         same_keyframe = found.keyframe_index == state.keyframe_index
         followed = same_keyframe and not state.lost and state.elapsed_s(frame.stamp_ns) > 0
+        if followed and 0 < state.frozen.repeats <= MOST_REPEATS and not len(result.weak):
+            state.T_keyframe_camera = result.T_reference_target
+            return
         # a stamp that came late makes the next interval too short
         elapsed_s = max(state.elapsed_s(frame.stamp_ns), 0.5 * state.intervals.median_s)
         step = se3.inverse(state.T_keyframe_camera) @ result.T_reference_target

@@ -26,6 +26,8 @@ from duagc.pipeline.recording import Motion, MotionPrior
 from duagc.pipeline.registration import Registration
 
 EXTRAPOLATED_INTERVALS = 1.5
+MOST_INTERVALS = 8
+"""That a velocity predicts, which was measured over one: images that waited in a driver come in bursts."""
 """Usual intervals between frames over which a velocity predicts in any case."""
 RECENT_FRAMES = 7  # whose mean velocity moves depth of another time
 
@@ -281,10 +283,11 @@ class TrackingState:
 
     def _is_fresh(self, elapsed_s: float) -> bool:
         """Whether the last velocity still predicts; from one frame to the next it does, however slow the camera."""
-        longest_s = max(
-            self.config.tracking.max_extrapolation_s, EXTRAPOLATED_INTERVALS * self.intervals.median_s
-        )
-        return elapsed_s <= longest_s
+        usual_s = self.intervals.median_s
+        longest_s = self.config.tracking.max_extrapolation_s
+        if usual_s > 0:
+            longest_s = min(longest_s, MOST_INTERVALS * usual_s)
+        return elapsed_s <= max(longest_s, EXTRAPOLATED_INTERVALS * usual_s)
 
     def is_long_lost(self, stamp_ns: int) -> bool:
         """Whether the camera is lost for so long that its last velocity means nothing any more.

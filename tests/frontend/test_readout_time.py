@@ -10,6 +10,7 @@ import pytest
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.config.motion_times import ReadoutConfig
+from duagc.pipeline.frontend.motion_differences import FoundTime
 from duagc.pipeline.frontend.readout_time import certain_readout
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -115,12 +116,19 @@ def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
     path = logs["upside down"]
     assert not found(path, CONFIG.model_copy(update={"sigmas": 1000.0})).rolls
     assert not found(path, CONFIG.model_copy(update={"min_pairs": 1000})).rolls
+    assert not found(path, CONFIG.model_copy(update={"most_sigma_s": 1e-6})).rolls
     assert not found(path, CONFIG.model_copy(update={"enabled": False})).rolls
     assert not found(path, CONFIG.model_copy(update={"least_move": 0.5})).rolls
     stated = write(tmp_path / "stated", CAMERA, images(Readout(READOUT_S), frames=3), Readout().notes())
     with open_rgbd(stated) as log:
         assert log.states_readout
         assert not certain_readout(log, [], CONFIG).rolls
+
+
+def test_a_long_time_that_is_hardly_known_is_not_certain() -> None:
+    """As found of a robot that turned at an even speed, whose camera has a global shutter."""
+    assert FoundTime(0.030, 0.009).is_certain(ReadoutConfig())
+    assert not FoundTime(0.085, 0.021).is_certain(ReadoutConfig())
 
 
 def parts_of(path: Path, out: Path, config: FrontendConfig) -> set[str]:
