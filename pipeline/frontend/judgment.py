@@ -179,22 +179,28 @@ def _parts(count: int, verdicts: Mapping[Ends, PairVerdict]) -> list[int]:
 
     Confirmed pairs connect. A pair that nothing can be said of connects two parts that no pair contradicts.
     """
-    part = list(range(count))
+    nearer = list(range(count))  # to the lowest of its part
+
+    def part(k: int) -> int:
+        while nearer[k] != k:
+            nearer[k] = nearer[nearer[k]]
+            k = nearer[k]
+        return k
 
     def join(a: int, b: int) -> None:
-        low, high = sorted((part[a], part[b]))
-        part[:] = [low if p == high else p for p in part]
+        low, high = sorted((part(a), part(b)))
+        nearer[high] = low
 
     for (first, second), verdict in verdicts.items():
         if verdict is PairVerdict.CONFIRMED:
             join(first, second)
+    against = [ends for ends, verdict in verdicts.items() if verdict.contradicts]
     for (first, second), verdict in sorted(verdicts.items()):
-        if verdict is PairVerdict.OPEN and part[first] != part[second]:
-            between = {part[first], part[second]}
-            against = (v for (i, j), v in verdicts.items() if {part[i], part[j]} == between)
-            if not any(v.contradicts for v in against):
+        if verdict is PairVerdict.OPEN and part(first) != part(second):
+            between = {part(first), part(second)}
+            if not any({part(i), part(j)} == between for i, j in against):
                 join(first, second)
-    return part
+    return [part(k) for k in range(count)]
 
 
 def _reason(keyframe: int, verdicts: Mapping[Ends, PairVerdict]) -> Reason:
