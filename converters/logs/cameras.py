@@ -23,15 +23,10 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording.names import DEPTH_SCALE_KEY
 from duagc.schemas import topics
 
-RECTIFIED = (
-    "rect"  # how a word begins in the name of images that are: image_rect_color, image_color_rect, rectified
-)
-TRANSPORTS = (
-    "compressed",
-    "compressedDepth",
-    "ffmpeg",
-    "foxglove",
-)  # last parts of topics, below those of images
+RECTIFIED = "rect"
+"""How a word begins in the name of images that are: image_rect_color, image_color_rect, left_rectified."""
+TRANSPORTS = ("compressed", "compressedDepth", "ffmpeg", "foxglove")
+"""Last parts of topics, below the name of their images."""
 SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
 
 

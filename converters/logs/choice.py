@@ -157,10 +157,9 @@ class Chooser:
             self.unread += f"; {error}"
 
     def _preferred(self, topics: Sequence[str]) -> Sequence[str]:
-        """Topics of images, if there are any; else of messages that hold both: they and video repeat images."""
-        kinds = [self.log.topics[topic] for topic in topics]
-        ranks = [2 if is_video(t.type) else int(holds_rgbd(ros_type(t.schema))) for t in kinds]
-        return [topic for topic, rank in zip(topics, ranks, strict=True) if rank == min(ranks)]
+        """Topics of images, if there are any; else of messages that hold both, else of video."""
+        first = min((repeats(self.log, topic) for topic in topics), default=0)
+        return [topic for topic in topics if repeats(self.log, topic) == first]
 
     def _is_named_depth(self, topic: str) -> bool:
         """Whether a topic is named as depth; the name of a sensor of both (/depth_cam/rgb) does not count."""
@@ -220,6 +219,17 @@ def _has(topic: str, hint: str) -> bool:
     if hint not in REGISTERED:
         return hint in topic.lower()
     return re.search(rf"(?<![a-z0-9]){hint}(?![a-z0-9])", topic.lower()) is not None
+
+
+def repeats(log: Log, topic: str) -> int:
+    """How likely images repeat those of other topics: 0 of their own, 1 below messages that hold both, 2 of video.
+
+    Args:
+        log: the log.
+        topic: of images.
+    """
+    known = log.topics[topic]
+    return 2 if is_video(known.type) else int(holds_rgbd(ros_type(known.schema)))
 
 
 def first_usable(log: Log, topic: str) -> Any:

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from duagc.converters.logs.choice import POINTS_TYPE, Chooser
+from duagc.converters.logs.choice import IMAGE_TYPES, POINTS_TYPE, Chooser, repeats
 from duagc.converters.logs.clocks import RobotClock, compare, overlap_warnings
 from duagc.converters.logs.entries import NANOSECONDS, Entry
 from duagc.converters.logs.files import SUFFIXES, Log, is_own_log, open_log
 from duagc.converters.logs.motion import IMU_TYPE, POSE_TYPES
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import Source, is_log, pieces_words, robot_of, sources_of, unread
+from duagc.converters.logs.video import is_video
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.recording.names import MAGIC, RECORDING_FILE
@@ -97,10 +98,19 @@ def _robots(src: Path) -> Iterator[tuple[Source, str]]:
 
 
 def namespaces(log: Log) -> list[str]:
-    """Namespaces of a log, if it has several that each have color and depth; else none."""
-    names = sorted({f"/{topic.lstrip('/').split('/')[0]}" for topic in Chooser(log).images})
-    inner = {name: Chooser(log, name) for name in names} if len(names) > 1 else {}
-    spaces = [name for name, of in inner.items() if of.color().topic and of.depth().topic]
+    """Namespaces of a log, if it has several that each have color and depth; else none.
+
+    Where messages that hold both, or video, only repeat what another namespace has, theirs does not count.
+    """
+    images = (t.name for t in log.topics.values() if t.count and (t.type in IMAGE_TYPES or is_video(t.type)))
+    names = sorted({f"/{name.lstrip('/').split('/')[0]}" for name in images})
+    ranks = {}
+    for name in names if len(names) > 1 else []:
+        inner = Chooser(log, name)
+        chosen = inner.color().topic, inner.depth().topic
+        if all(chosen):
+            ranks[name] = max(repeats(log, topic) for topic in chosen)
+    spaces = [name for name, rank in ranks.items() if rank == min(ranks.values())]
     return spaces if len(spaces) > 1 else []
 
 

@@ -190,7 +190,8 @@ def test_the_recording_is_that_of_separate_topics(
 def test_topics_of_their_own_count_before_them(tmp_path: Path) -> None:
     r = Ros(2)
     rows = scene(r)
-    both = rows + [row for row in together(r, rows, "realsense") if row[0] == "/camera/rgbd"]
+    held = [row for row in together(r, rows, "raw") if row[0] == "/camera/rgbd"]
+    both = rows + held + [("/rtabmap/rgbd_image", log_ns, m) for _, log_ns, m in held]
     log = write(tmp_path / "log.mcap", both, "cdr", r)
     [robot] = describe(log)["robots"].values()
     assert {k: c["topic"] for k, c in robot["choices"].items()} == {
@@ -199,6 +200,7 @@ def test_topics_of_their_own_count_before_them(tmp_path: Path) -> None:
         "color_info": "/camera/color/camera_info",
         "depth_info": "/camera/depth/camera_info",
     }
+    registry.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
 
 
 def test_a_log_lists_what_the_messages_hold(tmp_path: Path) -> None:
