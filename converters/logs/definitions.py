@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-_OF_DRIVERS = {
+OF_DRIVERS = {
     "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": """std_msgs/Header header
 int32 width
 int32 height
@@ -55,6 +55,6 @@ def of_ros2() -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in _OF_DRIVERS.items():
+    for name, text in OF_DRIVERS.items():
         store.register(get_types_from_msg(text, name))
     return store

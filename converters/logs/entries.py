@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 
@@ -74,6 +78,26 @@ def sound_time(time_ns: int, where: str) -> int:
     if not 0 <= time_ns < LAST_NS:
         raise DuagError(f"{where}: time {time_ns} ns, expected one between the years 1970 and 2116")
     return time_ns
+
+
+def raw_image(header: Any, pixels: NDArray[Any], encoding: str) -> SimpleNamespace:
+    """An Image with ROS's fields.
+
+    Args:
+        header: of the message.
+        pixels: [h, w, ...], bytes of the encoding, little-endian.
+        encoding: ROS's name of it.
+    """
+    rows = np.ascontiguousarray(pixels).reshape(len(pixels), -1).view(np.uint8)
+    return SimpleNamespace(
+        header=header,
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        is_bigendian=0,
+        step=rows.shape[1],
+        data=rows.reshape(-1),
+    )
 
 
 def ros_type(schema: str) -> str:

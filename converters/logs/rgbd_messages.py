@@ -11,17 +11,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
-from types import SimpleNamespace as Fields
 from typing import Any
 
-import numpy as np
-
-from duagc.converters.logs.entries import Entry, LogPart, LogTopic, stamp_ns
+from duagc.converters.logs.entries import Entry, LogPart, LogTopic, raw_image, stamp_ns
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 
 RGBA = b"\x08\x06"  # 8 bits, color type 6, in the first chunk of a PNG
-_TYPES = ("realsense2_camera_msgs/msg/RGBD", "rtabmap_msgs/msg/RGBDImage", "rtabmap_ros/msg/RGBDImage")
+_REALSENSE = "realsense2_camera_msgs/msg/RGBD"
+_RTABMAP = ("rtabmap_msgs/msg/RGBDImage", "rtabmap_ros/msg/RGBDImage")
 _MEMBERS = {  # of the messages, by the topics that they are read as
     "rgb/{image}": "rgb",
     "rgb/{image}/compressed": "rgb_compressed",
@@ -34,7 +32,7 @@ _MEMBERS = {  # of the messages, by the topics that they are read as
 
 def holds_rgbd(kind: str) -> bool:
     """Whether messages of a type hold color, depth and cameras; the type is ROS's name of it."""
-    return kind in _TYPES
+    return kind == _REALSENSE or kind in _RTABMAP
 
 
 def with_members(part: LogPart) -> LogPart:
@@ -61,7 +59,7 @@ class _WithMembers:
     def _add(self, topic: LogTopic) -> None:
         """Make the topics of the members known."""
         message = next(iter(self._part.entries([topic.name]))).read()
-        image = "image" if topic.type == _TYPES[0] else "image_rect"
+        image = "image_rect" if topic.type in _RTABMAP else "image"
         for name, member in _MEMBERS.items():
             value = getattr(message, member, None)
             added = f"{topic.name}/{name.format(image=image)}"
@@ -92,26 +90,15 @@ def _member(read: Any, member: str) -> Any:
     return value if floats is None else floats
 
 
-def _as_floats(image: Any) -> Fields | None:
-    """The raw image of depth that RTAB-Map compressed: a PNG of which a pixel's four bytes are a 32-bit number."""
+def _as_floats(image: Any) -> Any:
+    """Raw depth that RTAB-Map compressed, as a PNG of which a pixel's four bytes are a float; None: it is none."""
     head = bytes(image.data[:26])
     if not head.startswith(b"\x89PNG") or head[24:26] != RGBA:
         return None
     import cv2
 
     pixels = decode_image(bytes(image.data), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        return None
-    height, width = pixels.shape[:2]
-    return Fields(
-        header=image.header,
-        height=height,
-        width=width,
-        encoding="32FC1",
-        is_bigendian=0,
-        step=4 * width,
-        data=np.ascontiguousarray(pixels).reshape(-1),
-    )
+    return None if pixels is None else raw_image(image.header, pixels, "32FC1")
 
 
 def _stamp_ns(read: Any, member: str) -> int:

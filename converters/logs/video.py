@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.logs.entries import Entry
+from duagc.converters.logs.entries import Entry, raw_image
 
 _CODECS = {"264": "h264", "265": "h265", "hevc": "h265", "vp9": "vp9"}
 """By what the name of a format or of an encoder holds ("h264", "libx264", "hevc_nvenc")."""
@@ -94,16 +94,7 @@ class _Part:
             missing = "that needs pictures before the first one that needs none"
             why = self._fault or (missing if number is None else "of which a picture cannot be decoded")
             return Fields(header=packet.header, format=f"{_name(packet)} {why}", data=bytes(packet.data))
-        height, width = picture.shape[:2]
-        return Fields(
-            header=packet.header,
-            height=height,
-            width=width,
-            encoding="bgr8",
-            is_bigendian=0,
-            step=3 * width,
-            data=picture.reshape(-1),
-        )
+        return raw_image(packet.header, picture, "bgr8")
 
     @cached_property
     def _fault(self) -> str:

@@ -48,6 +48,7 @@ def without_scattered_holes(inverse_depth: Image, mask: masks.Mask | None) -> Im
 
 
 def _are_scattered(inverse_depth: Image) -> bool:
+    """Whether few of the known pixels of an image [h, w] have only known neighbors."""
     known = inverse_depth > 0
     rows = known[:, :-2] & known[:, 1:-1] & known[:, 2:]
     whole = rows[:-2] & rows[1:-1] & rows[2:]

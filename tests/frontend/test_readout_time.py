@@ -10,6 +10,7 @@ import pytest
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.config.motion_times import ReadoutConfig
+from duagc.pipeline.frontend import readout_time
 from duagc.pipeline.frontend.motion_differences import FoundTime
 from duagc.pipeline.frontend.readout_time import certain_readout
 from duagc.pipeline.frontend.stage import run_frontend
@@ -129,6 +130,18 @@ def test_a_long_time_that_is_hardly_known_is_not_certain() -> None:
     """As found of a robot that turned at an even speed, whose camera has a global shutter."""
     assert FoundTime(0.030, 0.009).is_certain(ReadoutConfig())
     assert not FoundTime(0.085, 0.021).is_certain(ReadoutConfig())
+
+
+@pytest.mark.parametrize(("left_s", "rolls"), [(0.004, True), (-0.004, True), (-0.090, False)])
+def test_a_readout_that_its_second_round_reverses_is_none(
+    logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, left_s: float, rolls: bool
+) -> None:
+    rounds = iter(([FoundTime(0.020, 0.005), None], [FoundTime(left_s, 0.001), None]))
+    monkeypatch.setattr(readout_time, "_estimated", lambda *_, **__: next(rounds))
+    config = CONFIG.model_copy(update={"move_to_track_again": CONFIG.least_move})  # two rounds
+    readout = found(logs["none"], config)
+    assert readout.rolls == rolls
+    assert not rolls or readout.color_s == pytest.approx(0.020 + left_s)
 
 
 def parts_of(path: Path, out: Path, config: FrontendConfig) -> set[str]:

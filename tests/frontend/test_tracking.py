@@ -226,35 +226,6 @@ def test_depth_of_long_before_makes_no_keyframe() -> None:
     assert len(tracker.keyframes) == 2
 
 
-def test_frames_that_come_again_were_taken_when_they_came_first() -> None:
-    """A driver under load repeats images; the camera goes on at its speed."""
-    shown = [0, 1, 2, 2, 4, 5, 5, 5, 8]
-    tracker = Tracker(CAMERA, CONFIG)
-    for k, step in enumerate(shown):
-        frame = tracker.track(k, 33_333_333 * k, *render(walk(step)))
-        assert frame.status is Status.OK
-        if k > 1:  # 0.8 m/s and rad/s, which would become 0 and then twice that
-            speed = se3.log(se3.inverse(walk(step - 1)) @ walk(step)) * 30
-            np.testing.assert_allclose(tracker.state.velocity, speed, atol=0.08)
-
-
-def test_a_camera_that_stands_still_has_no_velocity() -> None:
-    tracker = Tracker(CAMERA, CONFIG)
-    for k in range(12):
-        tracker.track(k, 33_333_333 * k, *render(walk(min(k, 3))))
-    np.testing.assert_allclose(tracker.state.velocity, np.zeros(6), atol=1e-3)
-
-
-def test_a_velocity_predicts_for_some_intervals_only() -> None:
-    """Images that waited in a driver come in bursts: 1 ms apart, then none for 130 ms."""
-    tracker = Tracker(CAMERA, CONFIG)
-    for k in range(8):
-        tracker.track(k, 1_000_000 * k, *render(walk(0.1 * k)))
-    late_ns = 1_000_000
-    assert tracker.state.depth_motion(8_000_000, late_ns) is not None
-    assert tracker.state.depth_motion(137_000_000, late_ns) is None
-
-
 def test_too_large_a_motion_is_not_called_tracked() -> None:
     tracker = Tracker(CAMERA, CONFIG)
     tracker.track(0, 0, *render(walk(0)))

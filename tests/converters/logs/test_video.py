@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from duagc.converters import registry
 from duagc.converters.layouts.ros_images import is_unusable
 from duagc.converters.logs import open_log
+from duagc.converters.logs.definitions import OF_DRIVERS
 from duagc.converters.logs.entries import Entry, stamp_ns
 from duagc.converters.logs.video import images
 from duagc.pipeline.base.errors import DuagError
@@ -28,15 +29,6 @@ from tests.fixtures.video_packets import Planes, packets, planes_of, shown
 
 COLOR = "/camera/color/image_raw"
 NEAR = 4  # of 255: the decoder computes colors with fewer digits
-FFMPEG = """std_msgs/Header header
-int32 width
-int32 height
-string encoding
-uint64 pts
-uint8 flags
-bool is_bigendian
-uint8[] data
-"""
 
 
 def colors_of(rows: list[Row]) -> list[NDArray[np.uint8]]:
@@ -53,7 +45,8 @@ def as_video(rows: list[Row], film: list[bytes], r: Ros, kind: str, name: str = 
     if kind == "FFMPEGPacket":
         from rosbags.typesys import get_types_from_msg
 
-        r.store.register(get_types_from_msg(FFMPEG, "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"))
+        name_of_type = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+        r.store.register(get_types_from_msg(OF_DRIVERS[name_of_type], name_of_type))
     left, found = list(film), list[Row]()
     for topic, log_ns, m in rows:
         if topic != COLOR:
