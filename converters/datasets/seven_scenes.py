@@ -311,7 +311,7 @@ def _write_robot(
         raw = np.rint(depth / DEPTH_SCALE).astype(np.uint16)
         robot.add_frame(stamp_ns, color, color_format, raw, T_world_camera=T_world_camera)
         holes += _count_holes(raw)
-        invalid += int((raw == 0).sum())
+        invalid += raw.size - int(np.count_nonzero(raw))
     pixels = len(frames) * WIDTH * HEIGHT
     rates = {"registered_without_depth": invalid / pixels, "registered_holes": holes / pixels}
     return {**rates, **check.result(label)}
@@ -331,11 +331,11 @@ def _true_pose(files: SevenScenesFrame, reference: Reference | None, options: Op
 
 def _count_holes(depth: NDArray[np.uint16]) -> int:
     """Pixels without depth whose left and right, or upper and lower, neighbors have some: cracks of the warp."""
-    empty, full = depth == 0, depth != 0
-    crack = np.zeros_like(empty)
-    crack[:, 1:-1] |= empty[:, 1:-1] & full[:, :-2] & full[:, 2:]
-    crack[1:-1] |= empty[1:-1] & full[:-2] & full[2:]
-    return int(crack.sum())
+    full = depth != 0
+    between = np.zeros_like(full)
+    np.logical_and(full[:, :-2], full[:, 2:], out=between[:, 1:-1])
+    between[1:-1] |= full[:-2] & full[2:]
+    return int(np.count_nonzero(between > full))
 
 
 def _depth_m(path: Path) -> Depth:
