@@ -2,7 +2,8 @@
 
 SRC is a sequence in the TUM-compatible form, for example `living_room_traj0_frei_png`: `associations.txt` (number and
 file of depth, then of color) and `*.gt.freiburg`. The poses are of a world with y up while the images are top-down:
-both are reflected at the xz plane, T' = S T S with S = diag(1, -1, 1, 1).
+both are reflected at the xz plane, T' = S T S with S = diag(1, -1, 1, 1). The offices and the first living room have
+no pose for their first image, which is kept without one.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Options(image_folder.LengthOptions):
     """Frames per second; the dataset numbers its frames."""
     first_pose: Literal["auto", "0", "1"] = "auto"
     """Number of the pose of image 0: some archives count images from 0 and poses from 1. auto: 0 if every image then
-    has a pose, else 1."""
+    has a pose, else 1; 0 too if only the first image has none."""
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
@@ -91,10 +92,15 @@ def _read_poses(src: Path) -> tuple[dict[int, np.ndarray], Path]:
 
 
 def _shift(images: dict[int, Any], poses: dict[int, Any], settings: Options, path: Path) -> int:
-    """What to add to the number of an image to get that of its pose."""
+    """What to add to the number of an image to get that of its pose; the first image may have none."""
     shifts = (0, 1) if settings.first_pose == "auto" else (int(settings.first_pose),)
-    for shift in shifts:
-        if all(n + shift in poses for n in images):
-            return shift
-    missing = next(n for n in sorted(images) if n + shifts[-1] not in poses)
-    raise DuagError(f"{path}: has no pose for image {missing}, expected one for every image")
+    numbers = sorted(images)
+    for without in (0, 1):
+        for shift in shifts:
+            if len(numbers) > without and all(n + shift in poses for n in numbers[without:]):
+                return shift
+    missing = next(n for n in numbers if n + shifts[-1] not in poses)
+    raise DuagError(
+        f"{path}: has no pose for image {missing}, expected one for every image but the first (--set first_pose=0 "
+        "or 1: number of the pose of image 0)"
+    )

@@ -135,6 +135,26 @@ def test_times_and_warnings(made: dict[str, tuple[Path, Path]]) -> None:
     assert "5 poses for frames up to 3" in stated("replica")
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_first_image_of_icl_nuim_may_have_no_pose(
+    first: int, made: dict[str, tuple[Path, Path]], tmp_path: Path
+) -> None:
+    """As of the first living room, whose images count from 0, and of the offices, whose images count from 1."""
+    copy, last = tmp_path / "icl", first + FRAMES - 1
+    shutil.copytree(made["icl-nuim"][0], copy)
+    lines = [f"{first + i} depth/{i}.png {first + i} rgb/{i}.png" for i in range(FRAMES)]
+    (copy / "associations.txt").write_text("\n".join(lines))
+    poses = [
+        tum_line(n, icl_nuim.S @ path(FRAMES)[n - first] @ icl_nuim.S) for n in range(first + 1, last + 1)
+    ]
+    (copy / "traj0.gt.freiburg").write_text("\n".join(text.replace(".0000", "", 1) for text in poses))
+    registry.convert("icl-nuim", copy, tmp_path / "rec")
+    found = true_poses(tmp_path / "rec", "alpha")
+    assert np.allclose(found, path(FRAMES)[1:], atol=2e-5)
+    stated = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
+    assert "alpha: 1 of 4 frames have no true pose" in stated
+
+
 def test_association_policies(made: dict[str, tuple[Path, Path]], tmp_path: Path) -> None:
     src, _ = made["tum"]
     registry.convert("tum", src, tmp_path / "near", options=["association=nearest"])
@@ -354,6 +374,11 @@ def test_other_cameras_in_the_layout_of_tum(made: dict[str, tuple[Path, Path]], 
     with open_rgbd(tmp_path / "named" / "alpha.mcap") as log:
         assert log.camera == PinholeCamera(640, 480, 530.0, 531.0, 320.5, 239.5)
         assert log.readout == Readout()
+    (other / "calibration.txt").unlink()
+    for name in ("kitchen_fr101", "infr1"):  # of no sequence of TUM
+        other = other.rename(tmp_path / name)
+        with pytest.raises(DuagError, match="expected --set intrinsics="):
+            registry.convert("tum", other, tmp_path / "none")
     for text in ("530 531 320", "530 531 320 x", "0 531 320 240"):
         with pytest.raises(DuagError, match="intrinsics"):
             registry.convert("tum", other, tmp_path / "bad", options=[f"intrinsics={text}"])
