@@ -21,6 +21,7 @@ from duagc.converters.layouts.ros_camera import RosCamera, between_images
 from duagc.converters.layouts.ros_images import check_decodes, color_bytes
 from duagc.converters.layouts.ros_points import PointTimes
 from duagc.converters.layouts.stereo import RawCamera, StereoRig
+from duagc.converters.logs.cameras import realsense_extrinsics
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import Transforms, body_axes_of_camera
 from duagc.converters.logs.motion import extrinsics_of
@@ -143,7 +144,7 @@ def stereo_of(
     """The pair of two image topics.
 
     Where the right camera is comes from `T_color_depth`, else from the P of its CameraInfo, else from constant
-    transforms.
+    transforms, or what RealSense's own software recorded.
 
     Args:
         log: the log.
@@ -186,13 +187,17 @@ def stereo_of(
         ]
         rig = StereoRig.projected(raw[0], raw[1], R, projections, where=where, options=settings)
         return Stereo(rig, size, where)
-    T_left_right = transforms.lookup(color[2].frame_id, right[2].frame_id)
+    frames = color[2].frame_id, right[2].frame_id
+    T_left_right = (
+        transforms.lookup(*frames) if any(frames) else realsense_extrinsics(log, color[0], right[0], log.name)
+    )
     if T_left_right is None:
         raise DuagError(
             f"{where}: P of {right[1]} has no base line, and /tf_static does not tie {right[2].frame_id!r} to "
             f"{color[2].frame_id!r}; expected --set T_color_depth='x y z qw qx qy qz' of the right camera"
         )
-    T_left_right = between_images(T_left_right, color[2], right[2], log.name)
+    if any(frames):
+        T_left_right = between_images(T_left_right, color[2], right[2], log.name)
     rig = StereoRig.of(raw[0], raw[1], se3.inverse(T_left_right), where, options=settings)
     return Stereo(rig, size, where)
 

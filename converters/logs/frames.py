@@ -73,11 +73,13 @@ class Transforms:
         return constant
 
     def lookup(self, target: str, source: str) -> Array | None:
-        """T_target_source [4, 4]; None if nothing constant ties them together.
+        """T_target_source [4, 4]; None if nothing constant ties them together, or one has no name.
 
         Raises:
             DuagError: only a transform that is none does.
         """
+        if not (frame_name(target) and frame_name(source)):
+            return None
         T = self._search(frame_name(target), frame_name(source))
         if T is None and not self._complete:
             self._complete = True

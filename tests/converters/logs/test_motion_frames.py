@@ -132,3 +132,14 @@ def test_an_imu_that_measures_no_turning_is_left_out(tmp_path: Path) -> None:
     out = convert(r, tmp_path, rows, "imu=/accel")
     assert any("/accel: all turning rates are zero" in w for w in warnings_of(out))
     assert not list(read_log(out / "alpha.mcap", ["/alpha/imu"]))
+
+
+def test_frames_without_a_name_are_tied_by_nothing(tmp_path: Path) -> None:
+    """Nobody said where an IMU is: that it has the axes of the camera would be a guess."""
+    r = Ros(2)
+    rows = still(r, ("/camera/color/image_raw", ""), ("/camera/color/depth_registered", ""))
+    rows += [("/imu", t, imu(r, t, "", np.array([0.1, 0.2, 0.3]))) for t in TIMES]
+    with pytest.raises(
+        DuagError, match=r"/imu is of '', and /tf_static does not tie it to ''; expected --set T_c"
+    ):
+        convert(r, tmp_path, rows, "imu=/imu", "registered=yes")
