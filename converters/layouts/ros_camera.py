@@ -19,8 +19,10 @@ FISHEYE = (
     "equidistant",
     "fisheye",
     "kannala_brandt",
+    "Kannala Brandt4",
 )  # one model, by the names that ROS, RealSense, Foxglove give it
-# with no name, as older drivers; RealSense names the model whose numbers are zero or those of plumb_bob
+# with no name, as older drivers; RealSense names the model whose numbers are zero or those of plumb_bob, which its ROS
+# driver calls plumb_bob and its rs2_project_point_to_pixel takes so, "inverse" (color of D455, D405) too
 POLYNOMIAL = (
     "",
     "plumb_bob",
@@ -29,6 +31,7 @@ POLYNOMIAL = (
     "brown_conrady",
     "Brown Conrady",
     "Modified Brown Conrady",
+    "Inverse Brown Conrady",
 )
 
 

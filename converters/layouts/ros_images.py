@@ -30,6 +30,7 @@ _COLOR_CODES = {  # encoding: channels, and the name of OpenCV's conversion to B
     "uyvy": (2, "COLOR_YUV2BGR_UYVY"),
     "yuv422_yuy2": (2, "COLOR_YUV2BGR_YUY2"),
     "yuyv": (2, "COLOR_YUV2BGR_YUY2"),
+    "YUYV": (2, "COLOR_YUV2BGR_YUY2"),  # as RealSense's own software names it
 }
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 

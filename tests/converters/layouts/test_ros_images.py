@@ -31,7 +31,7 @@ from tests.fixtures.rvl_images import rvl
         ("equidistant", [0.1, 0, 0, 0, 0.01], "of 'equidistant', expected 4 numbers"),
         ("equidistant", [0.1, 0, 0], "of 'equidistant', expected 4 numbers"),
         ("plumb_bob", [float("nan"), 0, 0, 0, 0], "of 'plumb_bob', expected"),
-        ("Inverse Brown Conrady", [0.1, 0, 0, 0, 0], "distortion model 'Inverse Brown Conrady'"),
+        ("Ftheta", [0.1, 0, 0, 0, 0], "distortion model 'Ftheta'"),
     ],
 )
 def test_lenses_that_are_not_known_are_refused(model: str, D: list[float], message: str) -> None:
@@ -44,9 +44,18 @@ def test_lenses_that_are_not_known_are_refused(model: str, D: list[float], messa
     assert RosCamera.of(info, False, "here").maps() is None
 
 
-def test_one_fisheye_model_has_three_names() -> None:
+def test_color_of_realsense_is_that_of_its_ros_driver_whatever_its_software_names_it() -> None:
     maps = []
-    for model in ("equidistant", "fisheye", "kannala_brandt"):
+    for model in ("plumb_bob", "Brown Conrady", "Modified Brown Conrady", "Inverse Brown Conrady"):
+        info = Ros(2).info(1, "c", COLOR, (-0.0565, 0.0682, 0.0004, 0.0007, -0.0218))
+        object.__setattr__(info, "distortion_model", model)
+        maps.append(RosCamera.of(info, False, "here").maps())
+    assert all(np.array_equal(maps[0], other) for other in maps[1:])
+
+
+def test_one_fisheye_model_has_four_names() -> None:
+    maps = []
+    for model in ("equidistant", "fisheye", "kannala_brandt", "Kannala Brandt4"):
         info = Ros(2).info(1, "c", COLOR)
         object.__setattr__(info, "distortion_model", model)
         object.__setattr__(info, "d", np.array([0.05, -0.01, 0.002, 0.0]))
