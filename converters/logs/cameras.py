@@ -103,6 +103,16 @@ class CameraWatch:
             )
 
 
+def image_path(topic: str) -> PurePosixPath:
+    """The topic of images by that of a transport of them: /image_raw of /image_raw/compressed.
+
+    Args:
+        topic: of images.
+    """
+    path = PurePosixPath(topic)
+    return path.parent if path.name in TRANSPORTS and path.parent.name else path
+
+
 def is_rectified(topic: str, own: bool = False) -> bool:
     """Whether images are undistorted, by the name of their topic.
 
@@ -110,8 +120,7 @@ def is_rectified(topic: str, own: bool = False) -> bool:
         topic: of the images.
         own: whether DUAG-C wrote the log.
     """
-    path = PurePosixPath(topic)
-    words = (path.parent if path.name in TRANSPORTS else path).name.split("_")
+    words = image_path(topic).name.split("_")
     return any(word.startswith(RECTIFIED) for word in words) or is_own_depth(topic, own)
 
 

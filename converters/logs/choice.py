@@ -10,6 +10,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from duagc.converters.layouts.ros_images import is_depth, is_unusable
+from duagc.converters.logs.cameras import image_path
 from duagc.converters.logs.entries import LogTopic, ros_type
 from duagc.converters.logs.files import Log, is_below
 from duagc.converters.logs.rgbd_messages import holds_rgbd
@@ -17,7 +18,7 @@ from duagc.converters.logs.video import is_video
 from duagc.pipeline.base.errors import DuagError, closest
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+INFO_TYPE, INFO_NAME = "sensor_msgs/msg/CameraInfo", "camera_info"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
 MOST_TRIED, MOST_PACKETS = 30, 1000  # images, and packets of video, that are read to find one that is sound
 PACKETS = (
@@ -28,7 +29,7 @@ PACKETS = (
     "RslidarScan",
     "NebulaPackets",
 )  # of LiDARs, likewise
-LEFT, RIGHT = ("left", "infra1", "cam0"), ("right", "infra2", "cam1")
+LEFT, RIGHT = ("left", "infra1", "infrared_1", "cam0"), ("right", "infra2", "infrared_2", "cam1")
 REGISTERED = (
     "aligned_depth_to_color",
     "depth_registered",
@@ -92,7 +93,9 @@ class Chooser:
         return choice if choice.topic else replace(choice, why=choice.why + self.unread)
 
     def depth(self) -> Choice:
-        """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does.
+        """Images that say that they are depth, of several those that are named so too.
+
+        mono16 may be infrared and counts only if it is named depth, or where nothing else does.
 
         Where depth comes from elsewhere (`depth_from`): the right images, or the points of a LiDAR.
         """
@@ -107,8 +110,10 @@ class Chooser:
                 return Choice("", f"no topic holds {POINTS_TYPE}{packet_words(self.log, self.namespace)}")
             return self._one("depth", self.clouds, (), "point", known=self.clouds)
         found = [t for t, m in self.images.items() if is_depth(m)]
-        sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
-        choice = self._one("depth", self._near_color(self._preferred(sure or found)), REGISTERED)
+        infrared = [t for t in found if getattr(self.images[t], "encoding", "") == "mono16"]
+        sure = [t for t in found if t not in infrared or self._is_named_depth(t)]
+        near = self._near_color(self._preferred(sure or found))
+        choice = self._one("depth", [t for t in near if "depth" in t.lower()] or near, REGISTERED)
         lost = [t for t, m in self.images.items() if self._is_named_depth(t) and not is_depth(m)]
         if not choice.topic and not choice.candidates and self.clouds:
             choice = replace(choice, why=f"{choice.why}, but there are points (depth_from=lidar)")
@@ -134,14 +139,20 @@ class Chooser:
         return [topic for topic, count in zip(topics, shared, strict=True) if count == max(shared)]
 
     def info(self, option: str, image_topic: str) -> Choice:
-        """CameraInfo of an image topic: the one whose name shares most with it."""
+        """CameraInfo of an image topic: the one where ROS looks for it, else whose name shares most with it."""
         if self._wanted.get(option):
             return self._told(option, self.infos)
+        by_parts = {_parts(info): info for info in self.infos}
+        for parts in info_parts(image_topic):
+            if parts in by_parts:
+                return Choice(by_parts[parts], "it lies next to the images", tuple(self.infos))
         shared = {info: shared_parts(image_topic, info) for info in self.infos}
         best = [info for info in self.infos if shared[info] == max(shared.values())]
         if len(best) != 1 or shared[best[0]] == 0:
             if not self.infos:
                 stated = f"{option.removesuffix('_info')}_camera='fx fy cx cy'"
+                if option == "depth_info" and self._wanted.get("depth_from") == "image":
+                    stated += ", or registered=yes if it is seen from color"
                 return Choice("", f"{image_topic} has CameraInfo on no topic", expected=stated)
             return Choice("", f"{image_topic} has CameraInfo on {', '.join(self.infos)}", tuple(self.infos))
         return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
@@ -258,6 +269,17 @@ def packet_words(log: Log, namespace: str) -> str:
 
 def _parts(topic: str) -> tuple[str, ...]:
     return PurePosixPath(topic.lstrip("/")).parts
+
+
+def info_parts(image_topic: str) -> list[tuple[str, ...]]:
+    """Where CameraInfo of images lies next to them: /rgb_camera_info of /rgb_image, else /camera_info, as ROS looks.
+
+    Args:
+        image_topic: of the images, or of a transport of them.
+    """
+    path = image_path(image_topic)
+    names = re.sub(r"image(_.*)?$", INFO_NAME, path.name), INFO_NAME
+    return [_parts(str(path.with_name(name))) for name in names]
 
 
 def shared_parts(a: str, b: str) -> int:

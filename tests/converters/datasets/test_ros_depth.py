@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from duagc.converters import registry
+from duagc.converters.logs import open_log
+from duagc.converters.logs.choice import Chooser
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -22,6 +24,7 @@ from tests.fixtures.ros_bags import (
     DEPTH,
     DISTORTION,
     FRAMES,
+    SMALL,
     START_NS,
     STEP_NS,
     T_COLOR_DEPTH,
@@ -100,6 +103,17 @@ def test_infrared_images_are_not_taken_for_depth(tmp_path: Path) -> None:
         DuagError, match="image_rect_raw/compressed holds no depth, or as JPEG, which destroys it"
     ):
         registry.convert("ros", r.write(tmp_path / "lost", lost, "mcap"), tmp_path / "rec2")
+
+
+def test_depth_of_sixteen_bits_is_told_by_its_name_from_infrared(tmp_path: Path) -> None:
+    """RealSense's own software records depth as mono16, and infrared of 16 bits as 16UC1."""
+    r, sensor = Ros(1), "/device_0/sensor_0"
+    rows = still(r, ("/device_0/sensor_1/Color_0/image/data", "c"), (f"{sensor}/Infrared_1/image/data", "c"))
+    units = np.full((SMALL.height, SMALL.width), 1500, np.uint16)
+    at = [ns for topic, ns, _ in rows if "Infrared_1/image/data" in topic]
+    rows += [(f"{sensor}/Depth_0/image/data", ns, r.image(ns, "c", units, "mono16")) for ns in at]
+    with open_log([r.write(tmp_path / "bag", rows, "plain")]) as log:
+        assert Chooser(log).depth().topic == f"{sensor}/Depth_0/image/data"
 
 
 def test_depth_that_is_too_far_is_told(tmp_path: Path) -> None:

@@ -7,10 +7,12 @@ from pathlib import Path
 import pytest
 
 from duagc.converters import registry
+from duagc.converters.logs import open_log
 from duagc.converters.logs.cameras import is_rectified
+from duagc.converters.logs.choice import Chooser
 from duagc.converters.logs.files import is_below
 from duagc.pipeline.recording import info
-from tests.fixtures.ros_bags import Ros, still
+from tests.fixtures.ros_bags import SMALL, START_NS, Ros, still
 
 
 def test_topics_without_a_leading_slash_are_found(tmp_path: Path) -> None:
@@ -51,3 +53,25 @@ def test_a_namespace_is_no_beginning_of_a_word() -> None:
 )
 def test_names_of_rectified_images(topic: str, rectified: bool) -> None:
     assert is_rectified(topic) == rectified
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "infos"),
+    [
+        ("/rgb", "/depth", ("/camera_info", "/camera_info")),  # Isaac Sim
+        ("/cam/image_raw", "/cam/depth/image_raw", ("/cam/camera_info", "/cam/depth/camera_info")),  # Gazebo
+        ("/a_rgb_image", "/a_depth_image", ("/a_rgb_camera_info", "/a_depth_camera_info")),
+        ("/cam/image", "/cam/depth_image", ("/cam/camera_info", "/cam/camera_info")),
+    ],
+)
+def test_camera_info_lies_next_to_its_images(
+    color: str, depth: str, infos: tuple[str, str], tmp_path: Path
+) -> None:
+    r = Ros(2)
+    rows = still(r, (color, "c"), (depth, "c"), {t: r.info(START_NS, "c", SMALL) for t in infos}, frames=1)
+    with open_log([r.write(tmp_path / "bag", rows, "mcap")]) as log:
+        chooser = Chooser(log)
+        found = [
+            chooser.info(f"{name}_info", topic).topic for name, topic in (("color", color), ("depth", depth))
+        ]
+    assert found == list(infos)
