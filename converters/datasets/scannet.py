@@ -63,7 +63,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
 def _numbered(folder: Path) -> dict[int, Path]:
     if not folder.is_dir():
         raise DuagError(
-            f"{folder}: no such folder, expected files named by number, as SensReader writes them"
+            f"{folder}: no such folder, expected files named by number, as SensReader/python of ScanNet exports a .sens"
         )
     return {int(p.stem): p for p in sorted(folder.iterdir()) if p.stem.isdecimal()}
 

@@ -88,7 +88,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
 
 def _camera(src: Path, settings: Options, image: Path) -> tuple[PinholeCamera, tuple[float, ...], str]:
     """Camera, distortion and name of the sensor: by the options, its calibration.txt, or the name of the folder."""
-    match = re.search(r"freiburg[123]|fr[123]", src.resolve().name)
+    match = re.search(r"(freiburg|(?<![a-z])fr)[123](?!\d)", src.resolve().name)
     stated = src / "calibration.txt"
     if settings.intrinsics:
         return *_stated(settings.intrinsics, "intrinsics", image), "depth camera"

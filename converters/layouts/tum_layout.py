@@ -184,7 +184,9 @@ class Poses:
             except ValueError:
                 values = []
             if len(values) != 7:
-                raise DuagError(f"{where}: {line.strip()[:60]!r}, expected eight numbers")
+                raise DuagError(
+                    f"{where}: {line.strip()[:60]!r}, expected eight numbers: time (s) x y z qx qy qz qw"
+                )
             if np.all(np.isfinite(values)) and np.linalg.norm(values[3:]) > 0.5:
                 rows.setdefault(nanoseconds(words[0], where), values)
             else:

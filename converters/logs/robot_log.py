@@ -155,17 +155,17 @@ class RobotLog:
         if text := stated(self.settings, option, bool(chooser.infos)):
             return ImageTopic(topic, frame, "", stated_camera(text, image, where))
         chosen = chooser.info(option, topic).required(self.log, option)
+        remedy = f"or --set {option.removesuffix('_info')}_camera='fx fy cx cy'"
         try:
             camera = RosCamera.of(self.log.first(chosen), self._is_rectified(topic), f"{self.name}: {chosen}")
         except DuagError as error:
-            option = option.removesuffix("_info")
-            raise DuagError(f"{error}, or --set {option}_camera='fx fy cx cy'") from error
+            raise DuagError(f"{error}, {remedy}") from error
         self._cameras[chosen] = (camera, self._is_rectified(topic))
         found = size_of(image, where)
         expected = camera.camera.width, camera.camera.height
         if found != expected:
             raise DuagError(
-                f"{where} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in {chosen}"
+                f"{where} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in {chosen}, {remedy}"
             )
         return ImageTopic(topic, frame, chosen, camera)
 
