@@ -43,14 +43,42 @@ def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate 
 
 
 def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> PoseCandidate:
-    """What was found, or where features have the frame, if only there it looks as usual by color and depth."""
-    if _looks_as_usual(state, found):
+    """What was found, or where features have the frame, if only there it looks as usual, or it fits better there.
+
+    A registration that went farther from the prediction than it converges from may have ended in a wrong minimum that
+    looks as usual, too.
+    """
+    usual = _looks_as_usual(state, found)
+    if usual and not _went_far(state, frame, found):
         return found
     for candidate in _from_features(state, frame, state.config.tracking):
+        if usual and candidate.keyframe_index != found.keyframe_index:
+            break
         other = verify(FOUND_NEARBY, state, frame, candidate)
-        if isinstance(other, PoseCandidate) and _looks_as_usual(state, other):
+        if isinstance(other, PoseCandidate) and (
+            (not usual and _looks_as_usual(state, other)) or _fits_better(state, other, found)
+        ):
             return other
     return found
+
+
+def _went_far(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> bool:
+    """Whether a view is farther from its prediction than dense registration converges from."""
+    if found.without is not Reason.NONE or state.lost:
+        return False
+    predicted = state.predict(frame.stamp_ns)
+    moved_px = state.distance_px(predicted.T_keyframe_camera, state.in_keyframe(found))
+    return predicted.sigma_px > 0 and moved_px > state.config.tracking.prior.max_deviation_px
+
+
+def _fits_better(state: TrackingState, candidate: PoseCandidate, found: PoseCandidate) -> bool:
+    """Whether another minimum of the same registration is the deeper one, by both residuals of unknown scales."""
+    other, result, tracking = candidate.result, found.result, state.config.tracking
+    if candidate.keyframe_index != found.keyframe_index or candidate.without is not found.without:
+        return False
+    apart_m, apart_rad = se3.distance(result.T_reference_target, other.T_reference_target)
+    apart = apart_m > tracking.stable_m or apart_rad > tracking.stable_rad
+    return bool(apart and other.rms_gray * other.rms_depth_m < result.rms_gray * result.rms_depth_m)
 
 
 def _looks_as_usual(state: TrackingState, candidate: PoseCandidate) -> bool:

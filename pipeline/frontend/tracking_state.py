@@ -219,6 +219,16 @@ class TrackingState:
         moved = tracking.prior.acceleration_m_s2 / self.keyframe.median_depth_m
         return self._coarsest_focal_px * (turned + moved) * 0.5 * elapsed_s**2
 
+    def distance_px(self, T_keyframe_camera: Array, T_keyframe_other: Array) -> float:
+        """How far two views are apart, pixels of the coarsest image of a registration.
+
+        Args:
+            T_keyframe_camera: [4, 4].
+            T_keyframe_other: [4, 4].
+        """
+        moved_m, turned_rad = se3.distance(T_keyframe_camera, T_keyframe_other)
+        return self._coarsest_focal_px * float(turned_rad + moved_m / self.keyframe.median_depth_m)
+
     def weakly_predicted(self, predicted: Prediction) -> bool:
         """Whether a camera that is not lost may be farther from the prediction than a registration reaches.
 

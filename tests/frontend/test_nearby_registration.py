@@ -87,6 +87,22 @@ def test_features_reject_a_frame_that_looks_worse_than_usual(
     assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
 
 
+@pytest.mark.parametrize(("predicted_px", "off_m"), [(1.0, 0.02), (6.0, 0.0)])
+def test_a_frame_far_from_its_prediction_is_where_it_fits_best_though_it_looks_as_usual(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch, predicted_px: float, off_m: float
+) -> None:
+    """Where a registration went farther than it converges from, it may have slid along a wall."""
+    state, frame = prepared(run)
+    predicted = state.predict(frame.stamp_ns)
+    tangent = np.array([0.0, 0.0, 0.0, 0.0, state.deviation_rad(predicted_px), 0.0])
+    aside = replace(predicted, T_keyframe_camera=predicted.T_keyframe_camera @ se3.exp(tangent))
+    assert not state.weakly_predicted(aside)
+    monkeypatch.setattr(state, "predict", lambda stamp_ns: aside)
+    off_by(0.02, 1.3, monkeypatch)
+    found = distance_m(run, state, nearby_registration.register_nearby(state, frame))
+    assert found == pytest.approx(off_m, abs=2e-3)
+
+
 def test_features_are_not_asked_of_a_frame_that_looks_as_usual(
     run: Undisturbed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
