@@ -378,6 +378,16 @@ def log_metadata(path: Path) -> dict[str, str]:
         return dict(log.metadata()).get(LOG_RECORD, {})
 
 
+def stated_digest(path: Path) -> str | None:
+    """The content digest that the writer of a log wrote into it; None if it states none.
+
+    Args:
+        path: of the log.
+    """
+    with LogFile(path) as log:
+        return dict(log.metadata()).get(DIGEST_RECORD, {}).get("sha256")
+
+
 def content_digest(path: Path) -> str:
     """64 hex characters that name what a log says, however its file is chunked and compressed."""
     with LogFile(path) as log:

@@ -29,6 +29,7 @@ from duagc.pipeline.messages import (
     Submap,
 )
 from duagc.pipeline.recording import Recording, read_exposures, read_log
+from duagc.pipeline.recording.read import stated_digest
 from duagc.pipeline.runs.digest import digest_file
 from duagc.pipeline.runs.metrics import sound_metrics
 from duagc.schemas import topics
@@ -257,8 +258,7 @@ class RunFolder:
         recording = Recording(path)
         for robot, expected in self._json("manifest.json").get("inputs", {}).items():
             log = recording.log(robot)
-            found = recording.digest(log.name)
-            found = digest_file(log) if found == "nothing" else found
+            found = stated_digest(log) or digest_file(log)  # recording.json is not trusted
             if found != expected:
                 raise DuagError(
                     f"{log}: has digest {found[:12]}, expected {str(expected)[:12]}, the log that "
