@@ -120,6 +120,8 @@ class Job:
             self.log(self._time_left.line())
 
     def _run(self) -> None:
+        if self.plan.has(stages.EXCHANGE):
+            steps.check_links(self.recording.robots, self.config)
         list(in_order(self._digest, map(self.recording.log, self.recording.robots)))  # side by side
         if self.plan.has(stages.EVALUATION) and (self.plan.calibrate or not self._is_stored()):
             from duagc.pipeline.evaluation import check_ground_truth

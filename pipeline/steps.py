@@ -6,7 +6,7 @@ here and all that it imports stay the same. So imports are inside the functions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex
 
@@ -149,6 +149,22 @@ def agent_input(robot: str, log: Path, folder: Path, config: RunConfig) -> Agent
     files = folder / "frontend.mcap", folder / "information.mcap"
     thickness_m = config.frontend.mapping.seeding.thickness_m
     return AgentInput(robot, log, *files, thickness_floor_m=thickness_m)
+
+
+def check_links(robots: Sequence[str], config: RunConfig) -> None:
+    """Refuse links of robots that are not there, before hours are spent on their maps.
+
+    Args:
+        robots: names of all robots of the recording.
+        config: of the run.
+
+    Raises:
+        DuagError: a window or waypoint names another robot, or a robot has no waypoint.
+    """
+    from duagc.pipeline.network.link_model import check_names
+
+    if config.exchange.link.enabled:
+        check_names(config.exchange.link, robots)
 
 
 def exchange(

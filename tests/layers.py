@@ -161,7 +161,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         _part(
             "steps",
             "how each stage is called",
-            "base config runs frontend information recording exchange fusion evaluation report viewing",
+            "base config runs frontend information recording network exchange fusion evaluation report viewing",
             "recalibration",
         ),
     ),

@@ -52,9 +52,10 @@ def neighbors(config: LinkConfig, robots: Sequence[str]) -> dict[str, tuple[str,
     Args:
         config: topology and switch of the links.
         robots: names of the team in any order, or of components; the topology is laid over the robots in
-            alphabetical order.
+            alphabetical order. Links of robots that are not among them, because no map could be begun in their logs,
+            count for nothing (`check_names` finds names that are wrong).
     Raises:
-        DuagError: a window or waypoint names a robot that is not in the team, or a robot has no waypoint.
+        DuagError: a robot has no waypoint.
     """
     components: dict[str, list[str]] = {}
     for name in sorted(robots):
@@ -73,13 +74,10 @@ def _edges(config: LinkConfig, names: list[str]) -> set[tuple[str, str]]:
     n = len(names)
     edges: set[tuple[int, int]] = set()
     if config.topology == "listed":
-        for window in config.windows:
-            _known(names, "windows", window.sender, window.receiver)
-        return {(window.sender, window.receiver) for window in config.windows}
+        ends = {(window.sender, window.receiver) for window in config.windows}
+        return {(sender, receiver) for sender, receiver in ends if sender in names and receiver in names}
     if config.topology == "range":
-        _known(names, "waypoints", *(waypoint.robot for waypoint in config.waypoints))
-        for missing in sorted(set(names) - {waypoint.robot for waypoint in config.waypoints}):
-            raise DuagError(f"exchange.link.waypoints: none of {missing}, expected one for each robot")
+        _check_waypoints(config, names)
     if config.topology in ("full", "range"):  # who is near may change
         edges = {(i, j) for i in range(n) for j in range(i)}
     elif config.topology == "star":
@@ -89,6 +87,30 @@ def _edges(config: LinkConfig, names: list[str]) -> set[tuple[str, str]]:
         if config.topology == "ring" and n > 2:
             edges.add((n - 1, 0))
     return {(names[i], names[j]) for i, j in edges}
+
+
+def check_names(config: LinkConfig, robots: Sequence[str]) -> None:
+    """Refuse links of robots that a recording does not have, before hours are spent on a run that could not meet.
+
+    Args:
+        config: topology of the links.
+        robots: names of all robots of the recording.
+
+    Raises:
+        DuagError: a window or waypoint names another robot, or a robot has no waypoint.
+    """
+    names = sorted(robots)
+    if config.topology == "listed":
+        for window in config.windows:
+            _known(names, "windows", window.sender, window.receiver)
+    if config.topology == "range":
+        _known(names, "waypoints", *(waypoint.robot for waypoint in config.waypoints))
+        _check_waypoints(config, names)
+
+
+def _check_waypoints(config: LinkConfig, names: list[str]) -> None:
+    for missing in sorted(set(names) - {waypoint.robot for waypoint in config.waypoints}):
+        raise DuagError(f"exchange.link.waypoints: none of {missing}, expected one for each robot")
 
 
 def _known(names: list[str], setting: str, *robots: str) -> None:

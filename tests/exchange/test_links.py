@@ -158,7 +158,9 @@ def test_range_follows_the_waypoints() -> None:
     with pytest.raises(DuagError, match="none of charlie, expected one for each robot"):
         neighbors(config, ["alpha", "bravo", "charlie"])
     with pytest.raises(DuagError, match="robot 'bravo', expected one of alpha"):
-        neighbors(config, ["alpha"])
+        link_model.check_names(config, ["alpha"])
+    link_model.check_names(config, ["alpha", "bravo"])
+    assert neighbors(config, ["alpha"]) == {"alpha": ()}  # no map could be begun in the log of bravo
 
 
 def test_links_survive_a_configuration_file(tmp_path: Path) -> None:
