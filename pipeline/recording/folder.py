@@ -137,6 +137,9 @@ def _read_description(path: Path) -> dict[str, Any]:
             )
         if not isinstance(row, dict) or not isinstance(row.get("log"), str):
             raise DuagError(f"{path}: robot {robot!r} has no log, expected the name of one")
+        if not isinstance(row.get("sensors") or {}, dict):
+            found = type(row["sensors"]).__name__
+            raise DuagError(f"{path}: {robot}.sensors is a {found}, expected a dict")
         _check_file_name(path, f"{robot}.log", row["log"])
         _check_file_name(path, f"{robot}.groundtruth", row.get("groundtruth"))
     return description

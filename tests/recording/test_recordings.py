@@ -118,6 +118,10 @@ def test_bugs_of_converters_are_errors(tmp_path: Path) -> None:
         ({"robots": {"../alpha": {"log": "alpha.mcap"}}}, "robot '../alpha'"),
         ({"robots": {"alpha": {"log": "../alpha.mcap"}}}, "alpha.log is '../alpha.mcap'"),
         ({"robots": {"alpha": {"log": "a.mcap", "groundtruth": 5}}}, "alpha.groundtruth is 5"),
+        (
+            {"robots": {"alpha": {"log": "a.mcap", "sensors": [5]}}},
+            "alpha.sensors is a list, expected a dict",
+        ),
         ({"geometry": "/etc/passwd"}, "geometry is '/etc/passwd'"),
     ],
 )
