@@ -25,6 +25,9 @@ from duagc.pipeline.frontend.tracking_state import Prediction, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, register
 
+REACH_SIGMAS = 3.0
+"""Standard deviations of a prediction within which a view is taken to be."""
+
 
 def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason:
     """The first registration near the last pose that passes its checks, or why the first one failed.
@@ -63,12 +66,19 @@ def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCand
 
 
 def _went_far(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> bool:
-    """Whether a view is farther from its prediction than dense registration converges from."""
+    """Whether a view is, or may well be, farther from its prediction than dense registration converges from."""
     if found.without is not Reason.NONE or state.lost:
         return False
     predicted = state.predict(frame.stamp_ns)
+    if _may_be_beyond_reach(state, predicted):
+        return True
     moved_px = state.distance_px(predicted.T_keyframe_camera, state.in_keyframe(found))
     return predicted.sigma_px > 0 and moved_px > state.config.tracking.prior.max_deviation_px
+
+
+def _may_be_beyond_reach(state: TrackingState, predicted: Prediction) -> bool:
+    """Whether a view may be farther from its prediction than dense registration converges from."""
+    return REACH_SIGMAS * predicted.sigma_px > state.config.tracking.prior.max_deviation_px
 
 
 def _fits_better(state: TrackingState, candidate: PoseCandidate, found: PoseCandidate) -> bool:
@@ -78,7 +88,43 @@ def _fits_better(state: TrackingState, candidate: PoseCandidate, found: PoseCand
         return False
     apart_m, apart_rad = se3.distance(result.T_reference_target, other.T_reference_target)
     apart = apart_m > tracking.stable_m or apart_rad > tracking.stable_rad
-    return bool(apart and other.rms_gray * other.rms_depth_m < result.rms_gray * result.rms_depth_m)
+    return bool(apart and _misfit(other) < _misfit(result))
+
+
+def _misfit(result: Registration) -> float:
+    """How badly views fit: both residuals, of unknown scales, and the share of the samples that they are of.
+
+    Residuals are of samples that agree. A wrong minimum may have small ones, for it leaves out what does not fit.
+    """
+    return result.rms_gray * result.rms_depth_m / max(result.overlap, 1e-6)
+
+
+def _or_from_coarser(
+    state: TrackingState, frame: CurrentFrame, predicted: Prediction, found: PoseCandidate
+) -> PoseCandidate:
+    """The same, or a registration that begins one image coarser, where that fits better.
+
+    A view is rarely farther from its prediction than `REACH_SIGMAS` standard deviations. Where that is beyond what a
+    registration reaches, a coarser image reaches twice as far; but it shows less, and may lead astray itself.
+    """
+    tracking = state.config.tracking
+    usual, iterations = tracking.registration, tracking.recovery.iterations
+    if not _may_be_beyond_reach(state, predicted) or len(iterations) <= len(usual.iterations):
+        return found
+    coarser = usual.model_copy(
+        update={"iterations": (*usual.iterations, *iterations[len(usual.iterations) :])}
+    )
+    result = register(
+        state.keyframe.reference,
+        frame.pyramid,
+        predicted.T_keyframe_camera,
+        coarser,
+        prior_information=predicted.information,
+    )
+    other = PoseCandidate(found.keyframe_index, result)
+    if result.ok and (not found.result.ok or _fits_better(state, other, found)):
+        return other
+    return found
 
 
 def _looks_as_usual(state: TrackingState, candidate: PoseCandidate) -> bool:
@@ -114,7 +160,10 @@ def _attempts(
                 tracking.registration,
                 prior_information=information,
             )
-            yield PoseCandidate(index, result), PLAUSIBLE if weak else FOLLOWED
+            candidate = PoseCandidate(index, result)
+            if start is predicted.T_keyframe_camera and not weak:
+                candidate = _or_from_coarser(state, frame, predicted, candidate)
+            yield candidate, PLAUSIBLE if weak else FOLLOWED
     if not weak:
         for candidate in _from_features(state, frame, tracking):
             yield candidate, FOUND_NEARBY

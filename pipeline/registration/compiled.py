@@ -51,7 +51,7 @@ def linearize_at(
     samples = reference.levels[index]
     level = _level_arrays(samples, pyramid.levels[index], config)
     numbers = alignment.align_at(
-        level, index, T_reference_target, exposure, settings=_settings(config), isa=isa
+        level, index, T_reference_target, exposure, settings=_settings(reference, config), isa=isa
     )
     return _system(numbers, len(samples))
 
@@ -91,7 +91,7 @@ def minimize(
         projection=None if projection is ALL_DIRECTIONS else projection,
         weights_by_correlation=config.weights_by_correlation,
     )
-    T, exposure, numbers, _ = alignment.align(levels, guess, _settings(config), search, isa=isa)
+    T, exposure, numbers, _ = alignment.align(levels, guess, _settings(reference, config), search, isa=isa)
     system = _system(numbers, len(reference.levels[0]))
     return T, exposure, system.by_correlation() if config.weights_by_correlation else system
 
@@ -111,7 +111,7 @@ def _level_arrays(samples: ReferenceLevel, level: Level, config: RegistrationCon
     )
 
 
-def _settings(config: RegistrationConfig) -> alignment.AlignmentSettings:
+def _settings(reference: Reference, config: RegistrationConfig) -> alignment.AlignmentSettings:
     return alignment.AlignmentSettings(
         use_depth=config.residuals != "gray",
         use_gray=config.residuals != "depth",
@@ -126,7 +126,7 @@ def _settings(config: RegistrationConfig) -> alignment.AlignmentSettings:
         sigma_nearest_m=NEAREST_M,
         depth_scale_floor=config.depth_sigma_floor,
         gray_scale_floor=config.gray_sigma_floor,
-        gray_floor_of_depth=config.gray_sigma_of_depth,
+        gray_floor_of_depth=config.gray_sigma_of_depth * reference.contrast,
         huber_sigmas=config.huber_sigmas,
         min_gradient=config.min_gradient,
         mad_stride=MAD_STRIDE,

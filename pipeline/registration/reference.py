@@ -15,6 +15,7 @@ Samples = NDArray[np.floating]
 
 DEFAULT_STRIDES = (4, 2, 1)
 GRADIENT_SHARE = 2 / 3  # of a sparse reference's samples; the rest is spread evenly for the geometry
+USUAL_CONTRAST = 0.1  # least standard deviation of gray values (0..1) of a well exposed view of a room
 MARGIN = 2  # pixels at the border that are not sampled
 
 
@@ -58,6 +59,12 @@ class Reference:
     """
 
     levels: tuple[ReferenceLevel, ...]
+
+    @property
+    def contrast(self) -> float:
+        """Share of the usual contrast, 0..1, by the coarsest level, where noise of pixels is averaged out."""
+        intensities = self.levels[-1].intensities
+        return min(float(intensities.std()) / USUAL_CONTRAST, 1.0) if len(intensities) else 0.0
 
     @staticmethod
     def from_pyramid(pyramid: RgbdPyramid, strides: tuple[int, ...] = DEFAULT_STRIDES) -> Reference:

@@ -182,7 +182,7 @@ def linearize_at(
     depth = _depth_residuals(surface, q, m, sigma, floor=floor, pixels=(u, v), config=config)
     if not level.has_depth:
         depth = depth.nothing()
-    floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * depth.scale)
+    floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * reference.contrast * depth.scale)
     images = gray, gu, gv
     by_depth = None
     if config.gray_noise_of_depth:

@@ -103,6 +103,41 @@ def test_a_frame_far_from_its_prediction_is_where_it_fits_best_though_it_looks_a
     assert found == pytest.approx(off_m, abs=2e-3)
 
 
+@pytest.mark.parametrize(("sigma_px", "off_m"), [(1.0, 0.02), (2.0, 0.0)])
+def test_where_a_frame_may_be_out_of_reach_a_coarser_image_is_tried_too(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch, sigma_px: float, off_m: float
+) -> None:
+    """And the registration that fits better counts."""
+    state, frame = prepared(run)
+    predicted = replace(state.predict(frame.stamp_ns), sigma_px=sigma_px)
+    assert not state.weakly_predicted(predicted)
+    monkeypatch.setattr(state, "predict", lambda stamp_ns: predicted)
+    monkeypatch.setattr(nearby_registration, "initial_motions", lambda state, frame: iter(()))
+    usual = state.config.tracking.registration
+
+    def register(reference, pyramid, T_guess, config, **options):
+        result = registration.register(reference, pyramid, T_guess, config, **options)
+        if len(config.iterations) > len(usual.iterations):
+            return result
+        T = result.T_reference_target @ se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        return replace(result, T_reference_target=T, rms_gray=1.3 * result.rms_gray)
+
+    monkeypatch.setattr(nearby_registration, "register", register)
+    found = distance_m(run, state, nearby_registration.register_nearby(state, frame))
+    assert found == pytest.approx(off_m, abs=2e-3)
+
+
+def test_of_two_minima_the_one_that_fewer_samples_fit_is_the_worse(run: Undisturbed) -> None:
+    state, frame = prepared(run)
+    found = nearby_registration.register_nearby(state, frame)
+    assert isinstance(found, PoseCandidate)
+    T = found.result.T_reference_target @ se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    slid = replace(found.result, T_reference_target=T, rms_gray=0.8 * found.result.rms_gray)
+    for overlap, better in ((0.9, True), (0.5, False)):
+        other = replace(found, result=replace(slid, overlap=overlap * found.result.overlap))
+        assert nearby_registration._fits_better(state, other, found) == better
+
+
 def test_features_are_not_asked_of_a_frame_that_looks_as_usual(
     run: Undisturbed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
