@@ -27,8 +27,8 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.base.workers import hand_down
 from duagc.pipeline.recording.access import check_read
-from duagc.pipeline.recording.identity import ContentDigest, channel_identity, framed
-from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC
+from duagc.pipeline.recording.identity import channel_identity, framed
+from duagc.pipeline.recording.names import LIBRARY, LOG_RECORD, MAGIC
 from duagc.schemas.topics import Topic
 from duagc.schemas.topics import find as find_topic
 
@@ -376,31 +376,3 @@ def log_metadata(path: Path) -> dict[str, str]:
     """What was given to the writer of the log: the robot and the metadata given to `LogWriter`."""
     with LogFile(path) as log:
         return dict(log.metadata()).get(LOG_RECORD, {})
-
-
-def stated_digest(path: Path) -> str | None:
-    """The content digest that the writer of a log wrote into it; None if it states none.
-
-    Args:
-        path: of the log.
-    """
-    with LogFile(path) as log:
-        return dict(log.metadata()).get(DIGEST_RECORD, {}).get("sha256")
-
-
-def content_digest(path: Path) -> str:
-    """64 hex characters that name what a log says, however its file is chunked and compressed."""
-    with LogFile(path) as log:
-        content = ContentDigest()
-        for record in log.records(None):
-            identity = log.identities[record.topic]
-            content.add(
-                identity,
-                record.log_time_ns,
-                record.publish_time_ns,
-                sequence=record.sequence,
-                data=record.data,
-            )
-        channels = [(log.identities[topic], channel.metadata) for topic, channel in log.channels.items()]
-        metadata = [(name, text) for name, text in log.metadata() if name != DIGEST_RECORD]
-        return content.finish(channels, metadata, log.attachments())

@@ -28,8 +28,7 @@ from duagc.pipeline.messages import (
     Odometry,
     Submap,
 )
-from duagc.pipeline.recording import Recording, read_exposures, read_log
-from duagc.pipeline.recording.read import stated_digest
+from duagc.pipeline.recording import Recording, read_exposures, read_log, stated_digest
 from duagc.pipeline.runs.digest import digest_file
 from duagc.pipeline.runs.metrics import sound_metrics
 from duagc.schemas import topics

@@ -18,8 +18,8 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry import depth_error, se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import Lens
-from duagc.pipeline.recording import LogWriter, Recording, RgbdFrame, open_rgbd, read_log
-from duagc.pipeline.recording.read import LogFile, content_digest
+from duagc.pipeline.recording import LogWriter, Recording, RgbdFrame, content_digest, open_rgbd, read_log
+from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics
 
 CAMERA = PinholeCamera(160, 120, 140.0, 142.0, 79.0, 60.5)
