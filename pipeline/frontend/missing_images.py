@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason, has_enough_depth, shows_anything
+from duagc.pipeline.frontend.nearby_registration import register_predicted
 from duagc.pipeline.frontend.tracking_state import TrackingState
-from duagc.pipeline.registration import register
 
 
 def missing_image(state: TrackingState, frame: CurrentFrame) -> Reason:
@@ -65,14 +65,7 @@ def follow_by_depth(state: TrackingState, frame: CurrentFrame) -> PoseCandidate 
     too_many = state.frames_without_color > tracking.failure.max_frames_without_color
     if too_many or state.lost or not state.keyframes:
         return Reason.FROZEN_COLOR
-    predicted = state.predict(frame.stamp_ns)
     depth_only = tracking.registration.model_copy(update={"residuals": "depth"})
-    result = register(
-        state.keyframe.reference,
-        frame.pyramid,
-        predicted.T_keyframe_camera,
-        depth_only,
-        prior_information=predicted.information,
-    )
+    result = register_predicted(state, frame, state.predict(frame.stamp_ns), depth_only)
     followed = PoseCandidate(state.keyframe_index, result, Reason.FROZEN_COLOR)
     return followed if result.ok else Reason.FROZEN_COLOR

@@ -23,7 +23,7 @@ from duagc.pipeline.frontend.pose_checks import (
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracking_state import Prediction, TrackingState
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration import Registration, register
+from duagc.pipeline.registration import Registration, RegistrationConfig, register
 
 REACH_SIGMAS = 3.0
 """Standard deviations of a prediction within which a view is taken to be."""
@@ -43,6 +43,26 @@ def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate 
             return _looking_as_usual(state, frame, found)
         reason = reason if reason is not Reason.NONE else found
     return reason
+
+
+def register_predicted(
+    state: TrackingState, frame: CurrentFrame, predicted: Prediction, config: RegistrationConfig
+) -> Registration:
+    """Register a frame to the latest keyframe from where it is predicted, with what the prediction knows.
+
+    Args:
+        state: what the tracker knows.
+        frame: the current frame.
+        predicted: where it should be.
+        config: of the registration.
+    """
+    return register(
+        state.keyframe.reference,
+        frame.pyramid,
+        predicted.T_keyframe_camera,
+        config,
+        prior_information=predicted.information,
+    )
 
 
 def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> PoseCandidate:
@@ -114,13 +134,7 @@ def _or_from_coarser(
     coarser = usual.model_copy(
         update={"iterations": (*usual.iterations, *iterations[len(usual.iterations) :])}
     )
-    result = register(
-        state.keyframe.reference,
-        frame.pyramid,
-        predicted.T_keyframe_camera,
-        coarser,
-        prior_information=predicted.information,
-    )
+    result = register_predicted(state, frame, predicted, coarser)
     other = PoseCandidate(found.keyframe_index, result)
     if result.ok and (not found.result.ok or _fits_better(state, other, found)):
         return other
@@ -144,24 +158,16 @@ def _attempts(
     tracking, index = state.config.tracking, state.keyframe_index
     last, predicted = state.T_keyframe_camera, state.predict(frame.stamp_ns)
     weak = state.weakly_predicted(predicted)
-    starts = [predicted.T_keyframe_camera]
+    starts = [predicted]
     if predicted.T_keyframe_camera is not last:
-        starts.append(last)
+        starts.append(Prediction(last, None))
     if weak:
         for candidate in _from_features(state, frame, tracking.verified_by_features()):
             yield candidate, FOUND_BY_FEATURES
     if not state.lost:
         for start in starts:
-            information = predicted.information if start is predicted.T_keyframe_camera else None
-            result = register(
-                state.keyframe.reference,
-                frame.pyramid,
-                start,
-                tracking.registration,
-                prior_information=information,
-            )
-            candidate = PoseCandidate(index, result)
-            if start is predicted.T_keyframe_camera and not weak:
+            candidate = PoseCandidate(index, register_predicted(state, frame, start, tracking.registration))
+            if start is predicted and not weak:
                 candidate = _or_from_coarser(state, frame, predicted, candidate)
             yield candidate, PLAUSIBLE if weak else FOLLOWED
     if not weak:
@@ -169,7 +175,7 @@ def _attempts(
             yield candidate, FOUND_NEARBY
     for start in starts:
         result = register_until_stable(
-            state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
+            state.keyframe, frame.pyramid, start.T_keyframe_camera, tracking, first=tracking.recovery
         )
         yield PoseCandidate(index, result), PLAUSIBLE if weak else FOUND_NEARBY
     if weak and (agreed := _from_all_around(state, frame, predicted)) is not None:
