@@ -4,11 +4,11 @@ import ast
 import inspect
 import sys
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -81,6 +81,8 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
         values = read_toml(Path(path), "a TOML configuration")
     for override in overrides:
         _apply(values, override)
+    for name in _booleans_for_numbers(model, values):
+        raise DuagError(f"{_said_where(name, source, overrides)}: {name} is true or false, expected a number")
     try:
         config = model.model_validate(values)
         _check_numbers(config, source)
@@ -88,6 +90,7 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
+        source = _said_where(name, source, overrides)
         if first["type"] == "extra_forbidden":
             nearest = _nearest(model, [str(part) for part in first["loc"]])
             raise DuagError(
@@ -96,6 +99,27 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
         if first["type"] == "value_error":
             raise DuagError(f"{source}: {first['ctx']['error']}") from error
         raise DuagError(f"{source}: {name} = {first['input']!r}: {first['msg']}") from error
+
+
+def _said_where(name: str, source: str, overrides: Sequence[str]) -> str:
+    """The override that says a setting, or the source of all that none says."""
+    said = (
+        f"--set {override}"
+        for override in reversed(overrides)
+        if f"{name}.".startswith(f"{override.partition('=')[0].strip()}.")
+    )
+    return next(said, source)
+
+
+def _booleans_for_numbers(model: type[Config], values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Names of numbers for which true or false was said; pydantic would take them as 1 and 0."""
+    for name, value in values.items():
+        kind = field.annotation if (field := model.model_fields.get(name)) else None
+        if isinstance(value, Mapping) and isinstance(kind, type) and issubclass(kind, Config):
+            yield from _booleans_for_numbers(kind, value, f"{prefix}{name}.")
+        kinds = get_args(kind) or (kind,)
+        if isinstance(value, bool) and bool not in kinds and not {int, float}.isdisjoint(kinds):
+            yield f"{prefix}{name}"
 
 
 def _check_numbers(config: Config, source: str, prefix: str = "") -> None:

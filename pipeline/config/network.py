@@ -80,6 +80,18 @@ class LinkConfig(Config):
                     f"exchange.link.windows: {window.sender} to {window.receiver} ends at {window.until_ns} ns, "
                     f"expected later than {window.from_ns} ns"
                 )
+        if self.windows and self.topology != "listed":
+            raise ValueError(
+                f"exchange.link.windows: topology is {self.topology!r}, expected 'listed' with them"
+            )
+        if (self.range_m > 0 or self.waypoints) and self.topology != "range":
+            raise ValueError(
+                f"exchange.link: topology is {self.topology!r}, expected 'range' with range_m and waypoints"
+            )
+        if self.burst_loss_probability < 1.0 and not self.burst_length_ns:
+            raise ValueError(
+                "exchange.link.burst_length_ns is 0, expected a length with burst_loss_probability"
+            )
         return self
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.base import Config, differing_settings, dump_config, load_config
+from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.config.run import RunConfig
 
 
@@ -58,6 +59,8 @@ def test_overrides_win_over_the_file(tmp_path: Path) -> None:
         ("link.loss_probability=much", "link.loss_probability = 'much'"),
         ("seed", "expected section.name=value"),
         ("seed.x=1", "seed = {'x': 1}"),
+        ("seed=true", "--set seed=true: seed is true or false, expected a number"),
+        ("link={loss_probability = false}", "link.loss_probability is true or false, expected a number"),
         pytest.param("seed=" + 400 * "9", "seed is 1.00000e+400, expected at most 4.61169e+18", id="large"),
         pytest.param("seed=-" + 400 * "9", "seed is -1.00000e+400, expected 0 or more", id="small"),
         pytest.param("seed=" + 5000 * "9", "value has 5000 digits", id="long"),
@@ -68,6 +71,30 @@ def test_errors_name_the_setting(override: str, expected: str) -> None:
         load_config(Whole, overrides=[override])
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_what_is_wrong_is_in_the_file_or_in_an_override(tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text("seed = 3\n[link]\nloss_probability = 'much'\n")
+    with pytest.raises(DuagError, match=f"^{path}: link.loss_probability = 'much'"):
+        load_config(Whole, path, ["seed=4"])
+    with pytest.raises(DuagError, match=r"^--set link.loss_probability=most: link.loss_probability = 'most'"):
+        load_config(Whole, path, ["link.loss_probability=most"])
+    with pytest.raises(DuagError, match=r"^--set lnk.name=a: lnk is not a known setting"):
+        load_config(Whole, overrides=["lnk.name=a", "seed=4"])
+
+
+@pytest.mark.parametrize(
+    ("link", "expected"),
+    [
+        ({"windows": ({"sender": "a", "receiver": "b"},)}, "topology is 'full', expected 'listed'"),
+        ({"range_m": 2.0}, "topology is 'full', expected 'range'"),
+        ({"burst_loss_probability": 0.9}, "burst_length_ns is 0, expected a length"),
+    ],
+)
+def test_a_link_has_no_setting_that_does_nothing(link: dict, expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        LinkConfig(**link)
 
 
 def test_broken_file_is_named(tmp_path: Path) -> None:
