@@ -82,6 +82,21 @@ class _Found:
             return self.of(robot, kind, "held_out") + peers if peers else []
         return self.scores.get((robot, kind, view_set), [])
 
+    def final_maps(self, robots: list[str]) -> _Found:
+        """The same with each robot's final map: of one that met no other the fused map, which nothing trained again.
+
+        Means of own and of final maps are then over the same views. Where no map was trained again, none is final.
+        """
+        trained = {robot for robot, kind, _ in self.scores if kind == "refined"}
+        alone = [robot for robot in robots if robot not in trained] if trained else []
+        final = {
+            (robot, "refined", s): self.scores[robot, "fused", s]
+            for robot in alone
+            for s in COMPARED_SETS
+            if (robot, "fused", s) in self.scores
+        }
+        return replace(self, scores=self.scores | final)
+
     def summary(self, robots: list[str], kind: str, view_set: str) -> dict[str, Any]:
         if kind == "own_unrefined":
             reason = "the front end wrote no map before its refinement"
@@ -186,7 +201,11 @@ def rendering_sections(of_robots: Mapping[str, Sequence[Scored]], *, longer: boo
         sets[CENTRAL] = COMPARED_SETS
     sets |= {"own_unrefined": ("held_out",)} | dict.fromkeys(("own", "fused"), (*COMPARED_SETS, "training"))
     compared = [kind for kind in sets if kind in (*COMPARED, CENTRAL)]
-    team = {kind: {s: found.summary(robots_of_run, kind, s) for s in sets[kind]} for kind in sets}
+    final = found.final_maps(robots_of_run)
+    team = {
+        kind: {s: (final if kind == "refined" else found).summary(robots_of_run, kind, s) for s in sets[kind]}
+        for kind in sets
+    }
     robots = {
         name: {kind: {s: found.summary([name], kind, s) for s in COMPARED_SETS} for kind in compared}
         for name in of_robots

@@ -1,5 +1,6 @@
 """How many views of each set maps are scored at, on a run whose every number is known."""
 
+from dataclasses import fields
 from inspect import signature
 from pathlib import Path
 
@@ -8,7 +9,9 @@ import pytest
 
 from duagc.pipeline.cli.runs import evaluate as evaluate_command
 from duagc.pipeline.evaluation import evaluate
-from duagc.pipeline.evaluation.rendering import MOST_VIEWS
+from duagc.pipeline.evaluation.rendering import MOST_VIEWS, rendering_sections
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.evaluation.views import ViewScore
 from tests.fixtures.fake_run import make
 
 
@@ -40,3 +43,26 @@ def test_few_keyframes_tell_how_well_maps_repeat_them(metrics: dict, tmp_path: P
 def test_the_command_scores_as_many_views_as_a_run() -> None:
     command = signature(evaluate_command).parameters["views"].default
     assert command == signature(evaluate).parameters["most_views"].default == MOST_VIEWS
+
+
+def test_means_of_own_and_of_final_maps_are_over_the_same_robots() -> None:
+    """A robot that met no other has no map that was trained again: its fused one is final."""
+    score = {
+        value: ViewScore(**dict.fromkeys([f.name for f in fields(ViewScore)], value))
+        for value in (20.0, 30.0, 31.0)
+    }
+    met = [
+        ("own", "held_out", 4, score[30.0]),
+        ("fused", "held_out", 4, score[30.0]),
+        ("refined", "held_out", 4, score[31.0]),
+    ]
+    alone = [(kind, "held_out", 4, score[20.0]) for kind in ("own", "fused")]
+    found = rendering_sections({"alpha": met, "alpha-2": alone}, longer=False)
+    assert [found.team[kind]["held_out"]["views"] for kind in ("own", "fused", "refined")] == [2, 2, 2]
+    assert (found.team["own"]["held_out"]["psnr_db"], found.team["refined"]["held_out"]["psnr_db"]) == (
+        25.0,
+        25.5,
+    )
+    assert isinstance(found.robots["alpha-2"]["refined"]["held_out"]["psnr_db"], Absent)
+    none = rendering_sections({"alpha": alone, "bravo": alone}, longer=False)
+    assert none.team["refined"]["held_out"]["views"] == 0
