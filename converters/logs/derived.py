@@ -193,8 +193,9 @@ def stereo_of(
     )
     if T_left_right is None:
         raise DuagError(
-            f"{where}: P of {right[1]} has no base line, and /tf_static does not tie {right[2].frame_id!r} to "
-            f"{color[2].frame_id!r}; expected --set T_color_depth='x y z qw qx qy qz' of the right camera"
+            f"{where}: P of {right[1] or 'the right camera'} has no base line, and /tf_static does not tie "
+            f"{right[2].frame_id!r} to {color[2].frame_id!r}; expected --set T_color_depth='x y z qw qx qy qz' of "
+            "the right camera"
         )
     if any(frames):
         T_left_right = between_images(T_left_right, color[2], right[2], log.name)

@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from duagc.converters.layouts.image_files import options_of
+from duagc.converters.logs.choice import IMAGE_TYPES
 from duagc.converters.logs.entries import NANOSECONDS
-from duagc.converters.logs.files import SUFFIXES, is_own_log
+from duagc.converters.logs.files import SUFFIXES, is_own_log, open_log
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.writer import robot_names
 from duagc.pipeline.base.atomic_folder import RECORDING, RUN
@@ -77,6 +78,8 @@ def sources_of(src: Path, options: Mapping[str, Any]) -> list[Source]:
     if spaces or settings.pieces:
         paths = tuple(logs_in(src))
         parts = [(paths, space, space) for space in spaces or [""]]
+        if not settings.pieces:
+            _check_one_log(src, paths, spaces)
     else:
         groups = _groups(src)
         parts = [(paths, "", label if len(groups) > 1 else "") for label, paths in groups.items()]
@@ -102,6 +105,19 @@ def _check_shared(settings: LogOptions, spaces: Sequence[str]) -> None:
             raise DuagError(
                 f"ros: {option}={said} for several robots, expected {hint}a TOML file that says whose it is"
             )
+
+
+def _check_one_log(src: Path, paths: Sequence[Path], spaces: Sequence[str]) -> None:
+    """Refuse logs that have the same images: they may be pieces of one, or logs of robots that are called alike."""
+    holding: dict[str, Path] = {}
+    for path in paths if len(paths) > 1 else ():
+        with open_log((path,), str(path)) as log:
+            for topic in (name for space in spaces for name in log.of_type(*IMAGE_TYPES, below=space)):
+                if (other := holding.setdefault(topic, path)) is not path:
+                    raise DuagError(
+                        f"{src}: {topic} is in {other.name} and in {path.name}, expected pieces=true if one goes on "
+                        "with the other, or a TOML file that lists the logs of each robot"
+                    )
 
 
 def _filled(settings: LogOptions, space: str) -> LogOptions:

@@ -86,6 +86,16 @@ def test_pieces_of_a_log(tmp_path: Path, names: tuple[str, str], gap_ns: int, is
     assert info(tmp_path / "rec")["robots"]["alpha"]["frames"] == 8
 
 
+def test_logs_of_robots_that_are_called_alike_are_not_one_log(tmp_path: Path) -> None:
+    r, logs = Ros(1), tmp_path / "logs"
+    logs.mkdir()
+    for k in range(2):
+        r.write(logs / f"robot_{k}", later(r, still(r), k * 15_000_000), "plain")
+    with pytest.raises(DuagError, match=r"is in robot_0.bag and in robot_1.bag, expected pieces=true"):
+        registry.convert("ros", logs, tmp_path / "rec", options=["namespaces=/camera"])
+    assert not (tmp_path / "rec").exists()
+
+
 def test_what_only_the_first_piece_says_is_missed_in_the_next(tmp_path: Path) -> None:
     r, logs = Ros(1), tmp_path / "split"
     logs.mkdir()
