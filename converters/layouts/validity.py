@@ -159,6 +159,10 @@ class UserMask:
         inside = np.zeros((height, width), dtype=np.uint8)
         corners = np.rint(np.array(self.polygon)).astype(np.int32)
         cv2.fillPoly(inside, [corners], (1,))
+        if not inside.any():
+            raise DuagError(
+                f"{self.where}: its polygon covers no pixel of {width}x{height} images, expected corners in them"
+            )
         return inside == 0
 
 

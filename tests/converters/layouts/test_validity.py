@@ -247,6 +247,7 @@ def test_a_mask_that_cannot_be_used_is_one_line(sequence: Path, tmp_path: Path, 
         ("[[masks]]\npolygon = [[0, 0], [1, 0]]", "expected at least three corners"),
         ("[[masks]]\npolygon = [[0, 0], [1, 0], [nan, 1]]", "expected at least three corners"),
         ("[[masks]]\nside = 3", "expected robot, file, polygon"),
+        ("[[masks]]\npolygon = [[640, 0], [900, 0], [900, 400]]", "covers no pixel of 640x480 images"),
         (
             "[[masks]]\nrobot = 'zulu'\npolygon = [[0, 0], [9, 0], [9, 9]]",
             "is of robot 'zulu', expected one of alpha",
