@@ -10,7 +10,7 @@ from typing import Any
 
 from duagc import __version__
 from duagc.pipeline import preparation
-from duagc.pipeline.base.files import new_file
+from duagc.pipeline.base.files import new_file, read_json
 from duagc.pipeline.cache.carrier import Carried
 from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
 from duagc.pipeline.runs.folder import SCHEMA
@@ -73,6 +73,18 @@ def write_manifest(
     if stages is not None:
         manifest["stages"] = {carried.label: _row(carried) for carried in stages}
     _write_json(folder / "manifest.json", manifest | dict(more))
+
+
+def name_recording(folder: Path, recording: Path) -> None:
+    """Let manifest.json of a finished run say where its recording is now, if that is elsewhere.
+
+    Args:
+        folder: of the run.
+        recording: that the run is of.
+    """
+    manifest = read_json(folder / "manifest.json", "the manifest of a run")
+    if not (folder / manifest["recording"]).exists():
+        _write_json(folder / "manifest.json", manifest | {"recording": preparation.way(folder, recording)})
 
 
 def add_stages(folder: Path, kept: Sequence[Carried]) -> None:

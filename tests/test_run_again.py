@@ -241,3 +241,18 @@ def test_stages_have_names(small_recording: Path, small_runs: Path) -> None:
         duagc_here("run", small_recording, "--out", small_runs / "none", "--no-cache", "--why").returncode
         == 2
     )
+    for option, stage in (("--until", "report"), ("--from", "evaluation")):
+        words = ("run", small_recording, "--out", small_runs / "none", "--no-evaluation", option, stage)
+        assert "expected without --from or --until" in duagc_here(*words).stderr
+
+
+def test_a_run_that_is_up_to_date_knows_where_its_recording_is_now(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    run, moved = small_runs / "run_moved", small_runs / "moved"
+    shutil.copytree(small_run, run)
+    shutil.copytree(small_recording, moved)
+    manifest = json.loads((run / "manifest.json").read_text())
+    (run / "manifest.json").write_text(json.dumps(manifest | {"recording": "../gone"}))
+    assert "up to date" in again(moved, run)[1][0]
+    assert json.loads((run / "manifest.json").read_text()) == manifest | {"recording": "../moved"}

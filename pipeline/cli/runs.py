@@ -22,6 +22,9 @@ from duagc.pipeline.cli.common import (
     say,
 )
 
+MEASURING = {"evaluation", "report"}
+"""Stages that `--no-evaluation` leaves out."""
+
 
 @app.command()
 def demo(
@@ -131,6 +134,10 @@ def run(
 
     if no_cache and (store is not None or since is not None or why):
         raise typer.BadParameter("expected without --store, --from, --why", param_hint="--no-cache")
+    if no_evaluation and not MEASURING.isdisjoint((since, until)):
+        raise typer.BadParameter(
+            "expected without --from or --until evaluation or report", param_hint="--no-evaluation"
+        )
     settings = load_config(RunConfig, config, overrides or [])
     place = None if no_cache else store or default_store(out)
     if why:
