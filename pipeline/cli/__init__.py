@@ -52,7 +52,7 @@ def main() -> None:
     """Entry point: one line and exit code 1 for whatever a user can fix."""
     determinism.configure_determinism()
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
+        if isinstance(stream, TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
             stream.reconfigure(errors="replace")  # a terminal may lack a letter of a name
     try:
         with ending_as_interrupts():

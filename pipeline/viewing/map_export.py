@@ -113,9 +113,10 @@ def _export_robot(run: RunFolder, robot: RobotRun, folder: Path, plan: ExportPla
     if plan.kind == "points":
         rows = np.flatnonzero(columns["opacity"][:, 0] >= plan.min_opacity)
         if not len(rows):
+            most = columns["opacity"].max(initial=0.0)
             raise DuagError(
-                f"{robot.folder}: the most opaque of {len(gaussians)} Gaussians has "
-                f"{columns['opacity'].max(initial=0.0):.2f}, expected --min-opacity {plan.min_opacity:g} or more"
+                f"{robot.folder}: the most opaque of {len(gaussians)} Gaussians has {most:.2f}, "
+                f"expected --min-opacity below {plan.min_opacity:g}"
             )
     parts: list[tuple[str, tuple[int, int, int] | None, NDArray[np.int64]]]
     if plan.tile_m is None:

@@ -84,7 +84,11 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_letter_that_the_terminal_lacks_is_replaced() -> None:
+@pytest.mark.parametrize(
+    "terminal",
+    [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}],
+)
+def test_a_letter_that_the_terminal_lacks_is_replaced(terminal: dict[str, str]) -> None:
     code = "from duagc.pipeline import cli; cli.app = lambda: print('sigma\\u00e9 \\u03c3'); cli.main()"
     result = subprocess.run(
         [sys.executable, "-c", code],
@@ -92,7 +96,7 @@ def test_a_letter_that_the_terminal_lacks_is_replaced() -> None:
         text=True,
         cwd=ROOT,
         check=False,
-        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+        env=os.environ | terminal,
     )
     assert (result.returncode, result.stdout, result.stderr) == (0, "sigma? ?\n", "")
 
