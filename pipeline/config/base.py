@@ -102,13 +102,12 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
 
 
 def _said_where(name: str, source: str, overrides: Sequence[str]) -> str:
-    """The override that says a setting, or the source of all that none says."""
-    said = (
-        f"--set {override}"
-        for override in reversed(overrides)
-        if f"{name}.".startswith(f"{override.partition('=')[0].strip()}.")
-    )
-    return next(said, source)
+    """The last override that says a setting, a section around it or a part of it; or the source of all others."""
+    for override in reversed(overrides):
+        said = f"{override.partition('=')[0].strip()}."
+        if said.startswith(f"{name}.") or f"{name}.".startswith(said):
+            return f"--set {override}"
+    return source
 
 
 def _booleans_for_numbers(model: type[Config], values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
