@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
@@ -98,18 +99,20 @@ def _robots(src: Path) -> Iterator[tuple[Source, str]]:
 
 
 def namespaces(log: Log) -> list[str]:
-    """Namespaces of a log, if it has several that each have color and depth; else none.
+    """Namespaces of a log, if it has several that each have color and depth, as images or points; else none.
 
-    Where messages that hold both, or video, only repeat what another namespace has, theirs does not count.
+    They are where the names of its images part: /fleet/r1 and /fleet/r2, or /r1 and /r2. Where messages that hold both, or video, only repeat what another namespace has, theirs does not count.
     """
-    images = (t.name for t in log.topics.values() if t.count and (t.type in IMAGE_TYPES or is_video(t.type)))
-    names = sorted({f"/{name.lstrip('/').split('/')[0]}" for name in images})
+    images = [t.name for t in log.topics.values() if t.count and (t.type in IMAGE_TYPES or is_video(t.type))]
+    folders = [name.strip("/").split("/")[:-1] for name in images]
+    shared = len(os.path.commonprefix(folders))
+    names = sorted({f"/{'/'.join(folder[: shared + 1])}" for folder in folders if len(folder) > shared})
     ranks = {}
     for name in names if len(names) > 1 else []:
         inner = Chooser(log, name)
-        chosen = inner.color().topic, inner.depth().topic
-        if all(chosen):
-            ranks[name] = max(repeats(log, topic) for topic in chosen)
+        color, depth = inner.color().topic, inner.depth().topic
+        if color and (depth or log.of_type(POINTS_TYPE, below=name)):
+            ranks[name] = max(repeats(log, topic) for topic in (color, depth) if topic)
     spaces = [name for name, rank in ranks.items() if rank == min(ranks.values())]
     return spaces if len(spaces) > 1 else []
 

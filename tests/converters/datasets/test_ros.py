@@ -13,7 +13,7 @@ from duagc.converters.logs.frames import pose_matrix
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.recording import open_rgbd, read_log
+from duagc.pipeline.recording import info, open_rgbd, read_log
 from duagc.schemas import topics
 from tests.fixtures.box_room import path, render
 from tests.fixtures.ros_bags import (
@@ -60,6 +60,19 @@ def test_every_container_gives_the_same_recording(tmp_path: Path, version: int, 
             assert np.median(np.abs(frame.color[inner].astype(int) - color[inner])) <= 2
     check = json.loads((tmp_path / "rec" / "recording.json").read_text())["checks"]["alpha"]
     assert check["reprojection_median_m"] < 0.05
+
+
+def test_namespaces_of_robots_inside_another(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = scene(r, prefix="/fleet/jackal") + scene(r, prefix="/fleet/husky", poses=path(FRAMES, 0.2))
+    bag = r.write(tmp_path / "bag", sorted(rows, key=lambda x: x[1]), "mcap")
+    words = "namespaces=/fleet/husky,/fleet/jackal"
+    with pytest.raises(DuagError, match=f"expected --set {words} if each"):
+        registry.convert("ros", bag, tmp_path / "rec")
+    registry.convert("ros", bag, tmp_path / "rec", options=[words])
+    assert sorted(info(tmp_path / "rec")["robots"]) == ["fleet_husky", "fleet_jackal"]
+    one = r.write(tmp_path / "one", scene(r, prefix="/fleet/jackal"), "mcap")
+    registry.convert("ros", one, tmp_path / "alone")
 
 
 def test_two_robots_in_one_bag_and_in_two(tmp_path: Path) -> None:
