@@ -73,7 +73,7 @@ def matched_pairs(
         extract(color, depth_m, camera, FEATURES, mask=mask)
         for color, depth_m, mask in zip(colors, depths_m, masks, strict=True)
     ]
-    found = (_matched(features[a], features[b], a, b) for a, b in combinations(range(len(features)), 2))
+    found = (match_views(features[a], features[b], a, b) for a, b in combinations(range(len(features)), 2))
     return [pair for pair in found if pair is not None]
 
 
@@ -102,7 +102,7 @@ def feature_agreement(
     }
 
 
-def _matched(ours: Features, theirs: Features, a: int, b: int) -> MatchedPair | None:
+def match_views(ours: Features, theirs: Features, a: int, b: int) -> MatchedPair | None:
     """Two views by the matches that agree on one motion; None if too few do."""
     pairs = matches(ours.descriptors, theirs.descriptors, RATIO)
     if len(pairs) < MIN_MATCHES:

@@ -15,6 +15,7 @@ from duagc.pipeline.base.worker_reports import OF_TEAM, Hear
 from duagc.pipeline.evaluation import (
     cameras,
     coverage,
+    depth_scales,
     groundtruth,
     map_errors,
     pixel_errors,
@@ -142,6 +143,7 @@ def evaluate(
             "exchange": session.exchange_section(),
             "consensus": session.consensus_section() | _matching_section(run, source, truth, session),
         }
+        scales = depth_scales.depth_scales(run, source, session.loop_closures)
         of_robots = measures()
     hear((OF_TEAM, "team", 0, 1))
     rendering = rendering_sections(
@@ -152,7 +154,11 @@ def evaluate(
         "robots": {
             name: _robot_section(robot, truth)
             | of_robots[name].agreement
-            | {"camera": cameras.section(robot), "rendering": rendering.robots[name]}
+            | {
+                "camera": cameras.section(robot),
+                "depth_scale": depth_scales.section(robot, scales),
+                "rendering": rendering.robots[name],
+            }
             for name, robot in run.robots.items()
         },
         "team": of_team["team"],

@@ -12,6 +12,8 @@ APART_PX = 1.0
 With exact cameras they are 0.15 to 0.65 px apart, with those that datasets state 1.7 to 2.1.
 """
 FEWEST_PAIRS = 10
+CERTAIN_SIGMAS = 4.0
+"""Scales of depth that differ by more standard deviations are said to."""
 
 
 def calibration_advice(run: RunFolder, source: Recording) -> str:
@@ -35,6 +37,26 @@ def calibration_advice(run: RunFolder, source: Recording) -> str:
     return (
         f"Matched features of held-out views are {', '.join(apart)} apart, with exact cameras below 0.7 px: "
         "`duagc run --calibrate` may give better poses and maps."
+    )
+
+
+def depth_scale_advice(run: RunFolder) -> str:
+    """A sentence that names robots whose depth is longer or shorter than that of the first of their component.
+
+    Args:
+        run: that was measured.
+    """
+    off = []
+    for name, robot in run.metrics["robots"].items():
+        scale = robot.get("depth_scale", {})  # runs of earlier versions have none
+        ratio, sigma = scale.get("depth_ratio"), scale.get("sigma_depth_ratio")
+        if ratio is not None and abs(ratio - 1.0) > CERTAIN_SIGMAS * sigma:
+            off.append(f"{name} measures {ratio:.3f} ± {sigma:.3f} times the distances")
+    if not off:
+        return ""
+    return (
+        f"Scales of depth differ: {', '.join(off)} of the first robot, of the same things; "
+        "poses between the robots are wrong by as much, and `depth_scale` at conversion corrects it."
     )
 
 

@@ -30,10 +30,13 @@ CAMERA = {
     f"{value}_{channel}": NUMBER
     for value in ("gain", "offset", "sigma_gain", "sigma_offset")
     for channel in ("red", "green", "blue")
-}
+} | {"matches": int}
+DEPTH_SCALE = {"depth_ratio": float, "sigma_depth_ratio": float, "depth_ratio_closures": int}
 SCHEMA = {
     "schema": int,
-    "robots": dict.fromkeys(("alpha", "bravo"), ROBOT | {"camera": CAMERA | {"matches": int}, "rendering": COMPARED}),
+    "robots": dict.fromkeys(
+        ("alpha", "bravo"), ROBOT | {"camera": CAMERA, "depth_scale": DEPTH_SCALE, "rendering": COMPARED}
+    ),
     "team": {
         "robots": int, "robots_in_largest_component": int, "ate_rmse_m": NUMBER, "ate_rmse_m_mean_of_robots": NUMBER,
         "inter_robot_loop_closures": int, "inter_robot_loop_closures_rejected": int,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from duagc.pipeline.report import advice
-from duagc.pipeline.report.advice import FEWEST_PAIRS, calibration_advice
+from duagc.pipeline.report.advice import FEWEST_PAIRS, calibration_advice, depth_scale_advice
 
 
 def run_of(calibration: tuple[str, ...] = (), pairs: int = 40, **off_px: float | None) -> Any:
@@ -52,3 +52,15 @@ def test_a_calibrated_recording_and_a_lidar_are_left_alone(source: Any) -> None:
     assert calibration_advice(run, source) == ""
     source.lidar, source.calibration = (), ["alpha: calibrated"]
     assert calibration_advice(run, source) == ""
+
+
+def test_robots_whose_depth_is_longer_are_named() -> None:
+    scales = {"alpha": None, "bravo": 1.021, "charlie": 1.009, "delta": 0.95}
+    robots = {
+        name: {"depth_scale": {"depth_ratio": s, "sigma_depth_ratio": 0.003}} for name, s in scales.items()
+    }
+    said = depth_scale_advice(SimpleNamespace(metrics={"robots": robots}))
+    assert "bravo measures 1.021 ± 0.003 times the distances, delta measures 0.950 ± 0.003 times" in said
+    assert "alpha" not in said
+    assert "charlie" not in said
+    assert depth_scale_advice(SimpleNamespace(metrics={"robots": {"alpha": {}}})) == ""

@@ -1,0 +1,120 @@
+"""How many times as far one robot's camera measures what another's measured, by features that both have seen.
+
+Loop closures fit rigid motions. A camera whose depth is a few percent too long joins all the same, and the paths of the
+team are wrong by these percents. In keyframes that see the same things, the features that agree on one motion spread in
+the ratio of both scales.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from duagc.pipeline.base.component_names import robot_of, same_robot
+from duagc.pipeline.evaluation.feature_agreement import FEATURES, MatchedPair, match_views
+from duagc.pipeline.evaluation.network import is_inlier
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.registration.features import Features, extract
+from duagc.pipeline.runs.folder import RobotRun, RunFolder
+
+MOST_CLOSURES = 16
+"""Loop closures of two robots that are looked at, evenly spread over those that count."""
+FEWEST_CLOSURES = 4
+FLOOR = 0.003
+"""Smallest stated deviation of a ratio: teams of unlike cameras with equal scales measured 0.9975 to 1.0032."""
+
+
+@dataclass(frozen=True)
+class DepthScale:
+    """The scale of a robot's depth relative to another's.
+
+    Attributes:
+        ratio: this robot's distances over the other's, of the same things.
+        sigma: its standard deviation.
+        closures: loop closures that it is the median of.
+    """
+
+    ratio: float
+    sigma: float
+    closures: int
+
+
+def depth_scales(
+    run: RunFolder, source: Recording, decisions: Iterable[Any]
+) -> dict[tuple[str, str], DepthScale]:
+    """Ratios of all pairs of robots with enough loop closures, by (robot, other), in order of these names.
+
+    Args:
+        run: the run.
+        source: its recording.
+        decisions: every duagc.v1.LoopClosureDecision.
+    """
+    keyframes: dict[tuple[str, str], set[tuple[int, int]]] = defaultdict(set)
+    for d in decisions:
+        if is_inlier(d) and not same_robot(d.robot, d.peer):
+            (robot, own), (other, theirs) = sorted([(d.robot, d.own_keyframe), (d.peer, d.peer_keyframe)])
+            keyframes[robot, other].add((own, theirs))
+    found = {}
+    with ExitStack() as opened:
+        logs = {name: opened.enter_context(open_rgbd(source.log(name))) for name in source.robots}
+
+        @cache
+        def features(robot: str, keyframe: int) -> Features:
+            log = logs[robot_of(robot)]
+            frame = log.frame(run.robots[robot].keyframes[keyframe].frame_index)
+            return extract(frame.color, frame.usable_depth, log.camera, FEATURES, mask=frame.mask)
+
+        for (robot, other), all_ends in sorted(keyframes.items()):
+            if len(all_ends) < FEWEST_CLOSURES:
+                continue
+            spread = np.linspace(0, len(all_ends) - 1, min(len(all_ends), MOST_CLOSURES))
+            ends = [sorted(all_ends)[k] for k in spread.round().astype(int)]
+            pairs = [match_views(features(robot, a), features(other, b), a, b) for a, b in ends]
+            scales = [_log_ratio(pair) for pair in pairs if pair is not None]
+            if len(scales) >= FEWEST_CLOSURES:
+                found[robot, other] = _median(scales)
+    return found
+
+
+def section(robot: RobotRun, scales: Mapping[tuple[str, str], DepthScale]) -> dict[str, float | Absent]:
+    """What metrics.json says of one robot: its scale relative to that of the first robot of its component.
+
+    Args:
+        robot: of the run.
+        scales: of pairs.
+    """
+    names, first = ("depth_ratio", "sigma_depth_ratio", "depth_ratio_closures"), robot.component[0]
+    scale = scales.get((first, robot.robot))
+    if len(robot.component) < 2:
+        return dict.fromkeys(names, Absent("this robot met no other robot"))
+    if first == robot.robot:
+        return dict.fromkeys(names, Absent("the others' cameras are held against this one"))
+    if scale is None:
+        return dict.fromkeys(
+            names, Absent("too few loop closures with the first robot have features in common")
+        )
+    inverse = 1.0 / scale.ratio
+    return dict(zip(names, (inverse, scale.sigma * inverse**2, scale.closures), strict=True))
+
+
+def _log_ratio(pair: MatchedPair) -> float:
+    """Logarithm of the spread of the first view's points over that of the second's."""
+    spread_a, spread_b = (
+        float(np.sum((points - points.mean(axis=0)) ** 2)) for points in (pair.points_a, pair.points_b)
+    )
+    return 0.5 * float(np.log(spread_a / spread_b))
+
+
+def _median(scales: list[float]) -> DepthScale:
+    values = np.array(scales)
+    median = float(np.median(values))
+    sigma = 1.4826 * float(np.median(np.abs(values - median))) / np.sqrt(len(values))
+    ratio = float(np.exp(median))
+    return DepthScale(ratio, ratio * max(FLOOR, float(sigma)), len(values))

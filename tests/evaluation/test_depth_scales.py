@@ -1,0 +1,40 @@
+"""Scales of depth of a team, by features of keyframes that loop closures tie."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from duagc.pipeline.evaluation import depth_scales
+from duagc.pipeline.evaluation.network import Session
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.runs.folder import RunFolder
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.02, 0.95])
+def test_depth_that_is_longer_is_found(
+    small_run: Path, small_recording: Path, monkeypatch: pytest.MonkeyPatch, scale: float
+) -> None:
+    @contextmanager
+    def scaled(path: Path):
+        with open_rgbd(path) as log:
+            factor = scale if log.robot == "bravo" else 1.0
+
+            def frame(index: int):
+                seen = log.frame(index)
+                return replace(seen, depth=seen.depth * factor)
+
+            yield SimpleNamespace(camera=log.camera, frame=frame)
+
+    monkeypatch.setattr(depth_scales, "open_rgbd", scaled)
+    run = RunFolder(small_run)
+    found = depth_scales.depth_scales(run, Recording(small_recording), Session(run).loop_closures)
+    of_bravo = depth_scales.section(run.robots["bravo"], found)
+    assert of_bravo["depth_ratio"] == pytest.approx(scale, abs=0.005)
+    assert of_bravo["sigma_depth_ratio"] < 0.01
+    assert of_bravo["depth_ratio_closures"] >= depth_scales.FEWEST_CLOSURES
+    assert isinstance(depth_scales.section(run.robots["alpha"], found)["depth_ratio"], Absent)
+    assert isinstance(depth_scales.section(run.robots["bravo"], {})["depth_ratio"], Absent)
