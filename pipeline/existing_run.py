@@ -31,6 +31,8 @@ REWRITTEN = (stages.EVALUATION.name, stages.REPORT.name)
 def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> bool:
     """Whether a run is what it would be now; False: it is the beginning of that, or a file of it is damaged.
 
+    Where a run is, it knows the place of its recording from now on.
+
     Args:
         recording: that the run is of.
         out: folder of an earlier run.
@@ -64,6 +66,7 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
         if name:
             log(f"{out / name}: is not what was computed; taken from the store")
             return False
+    manifest.name_recording(out, recording.path)
     return True
 
 
