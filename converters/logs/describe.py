@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -101,11 +101,12 @@ def _robots(src: Path) -> Iterator[tuple[Source, str]]:
 def namespaces(log: Log) -> list[str]:
     """Namespaces of a log, if it has several that each have color and depth, as images or points; else none.
 
-    They are where the names of its images part: /fleet/r1 and /fleet/r2, or /r1 and /r2. Where messages that hold both, or video, only repeat what another namespace has, theirs does not count.
+    They are where the names of its images part: /fleet/r1 and /fleet/r2, or /r1 and /r2.
+    Where messages that hold both, or video, only repeat what another namespace has, theirs does not count.
     """
     images = [t.name for t in log.topics.values() if t.count and (t.type in IMAGE_TYPES or is_video(t.type))]
     folders = [name.strip("/").split("/")[:-1] for name in images]
-    shared = len(os.path.commonprefix(folders))
+    shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
     names = sorted({f"/{'/'.join(folder[: shared + 1])}" for folder in folders if len(folder) > shared})
     ranks = {}
     for name in names if len(names) > 1 else []:
