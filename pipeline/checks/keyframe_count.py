@@ -16,7 +16,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.checks import KeyframeChecks
 from duagc.pipeline.config.frontend import KeyframeConfig
 from duagc.pipeline.config.registration import RegistrationConfig
-from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
+from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe, shared_view
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration import Reference, RgbdPyramid, register
@@ -140,7 +140,7 @@ class _Place:
             result = register(self._reference, pyramid, guess, REGISTRATION)
             if result.ok:
                 leaves = becomes_keyframe(result, pyramid, self._rule)
-                return leaves, gap, 1 - min(result.overlap, result.view), result.T_reference_target
+                return leaves, gap, 1 - shared_view(result, pyramid), result.T_reference_target
         return None
 
     def _pyramid(self, gap: int) -> RgbdPyramid:

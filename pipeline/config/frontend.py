@@ -76,7 +76,7 @@ class KeyframeConfig(Config):
     """When a frame becomes a keyframe, and how keyframe poses are optimized together."""
 
     min_overlap: float = 0.8
-    """A frame that sees less of its keyframe than this becomes the next one."""
+    """A frame becomes a keyframe when one sees less of the other than this share."""
     max_translation_of_depth: float = 0.3
     """A frame that moved by more than this fraction of the median depth becomes a keyframe."""
     max_rotation_rad: float = 0.5

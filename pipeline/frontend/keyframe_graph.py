@@ -72,7 +72,7 @@ class OptimizedKeyframes:
 
 
 def becomes_keyframe(result: Registration, pyramid: RgbdPyramid, config: KeyframeConfig) -> bool:
-    """Whether a tracked frame sees too little of its keyframe, or moved or turned too far from it.
+    """Whether a tracked frame shares too little with its keyframe, or moved or turned too far from it.
 
     Motion is measured by the median depth: a step of 10 cm changes a near view more than a far one.
 
@@ -81,7 +81,24 @@ def becomes_keyframe(result: Registration, pyramid: RgbdPyramid, config: Keyfram
         pyramid: of the frame.
         config: the limits.
     """
-    return leaves_keyframe(min(result.overlap, result.view), result.T_reference_target, pyramid, config)
+    return leaves_keyframe(shared_view(result, pyramid), result.T_reference_target, pyramid, config)
+
+
+def shared_view(result: Registration, pyramid: RgbdPyramid) -> float:
+    """The smaller share that a frame and its keyframe see of each other, 0..1.
+
+    A camera that goes back sees all of its keyframe, and more and more around it.
+
+    Args:
+        result: registration of the frame to its keyframe.
+        pyramid: of the frame; its camera is that of the keyframe.
+    """
+    camera, points = pyramid.levels[-1].camera, pyramid.levels[-1].points
+    seen = se3.transform(result.T_reference_target, points)
+    seen = seen[seen[:, 2] > 0]
+    u, v = camera.project(seen).T
+    inside = (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+    return min(result.overlap, result.view, np.count_nonzero(inside) / max(len(points), 1))
 
 
 def leaves_keyframe(
