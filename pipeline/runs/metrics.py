@@ -26,6 +26,7 @@ class _Table(BaseModel):
 class _Robot(_Table):
     frames: Number
     camera: Scores = {}
+    depth_scale: Scores = {}
     rendering: Maps
 
 

@@ -11,7 +11,7 @@ from tests.fixtures.films import CAMERA, FRAMES, filmed
 
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
 STARTS = (17, 34, 50)  # frames before which a disturbance begins
-START_OF_COMPARISONS = 45  # likewise, for the tests of what a pose is compared with
+START_OF_COMPARISONS = 52  # likewise, for the tests of what a pose is compared with
 
 
 @pytest.fixture(scope="session")
