@@ -11,6 +11,7 @@ from typing import Any
 
 from duagc.pipeline import manifest
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_json
 from duagc.pipeline.cache.carrier import Carried, intact, words
 from duagc.pipeline.cache.file_digests import FileDigest, FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
@@ -30,8 +31,6 @@ REWRITTEN = (stages.EVALUATION.name, stages.REPORT.name)
 
 def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> bool:
     """Whether a run is what it would be now; False: it is the beginning of that, or a file of it is damaged.
-
-    Where a run is, it knows the place of its recording from now on.
 
     Args:
         recording: that the run is of.
@@ -66,8 +65,19 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
         if name:
             log(f"{out / name}: is not what was computed; taken from the store")
             return False
-    manifest.name_recording(out, recording.path)
     return True
+
+
+def follow_recording(recording: Recording, out: Path) -> None:
+    """Let a run that is up to date know its recording, where that is no longer at the place that it names.
+
+    Args:
+        recording: that the run is of.
+        out: folder of the run.
+    """
+    named = read_json(out / "manifest.json", "the manifest of a run").get("recording", "")
+    if not (out / str(named)).is_dir() or not named:
+        manifest.name_recording(out, recording.path)
 
 
 def _damaged_table(out: Path) -> str:

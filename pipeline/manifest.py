@@ -76,15 +76,14 @@ def write_manifest(
 
 
 def name_recording(folder: Path, recording: Path) -> None:
-    """Let manifest.json of a finished run say where its recording is now, if that is elsewhere.
+    """Let manifest.json of a finished run say where its recording is now.
 
     Args:
         folder: of the run.
         recording: that the run is of.
     """
     manifest = read_json(folder / "manifest.json", "the manifest of a run")
-    if not (folder / manifest["recording"]).exists():
-        _write_json(folder / "manifest.json", manifest | {"recording": preparation.way(folder, recording)})
+    _write_json(folder / "manifest.json", manifest | {"recording": preparation.way(folder, recording)})
 
 
 def add_stages(folder: Path, kept: Sequence[Carried]) -> None:

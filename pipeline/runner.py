@@ -17,7 +17,7 @@ from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.packages import check_packages
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.existing_run import is_up_to_date, keep_what_holds
+from duagc.pipeline.existing_run import follow_recording, is_up_to_date, keep_what_holds
 from duagc.pipeline.job import Job
 from duagc.pipeline.preparation import Say, read_code, say
 from duagc.pipeline.run_plan import LAST, RunPlan
@@ -85,6 +85,7 @@ def _run(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, l
     force, completed = plan.force, False
     if out.exists() and not force and plan.store is not None:
         if is_up_to_date(recording, out, config, plan, log=log):
+            follow_recording(recording, out)
             log(f"{out}: up to date")
             return
         force = completed = True

@@ -33,10 +33,10 @@ FLOOR = 0.003
 
 @dataclass(frozen=True)
 class DepthScale:
-    """The scale of a robot's depth relative to another's.
+    """The scale of a robot's depth relative to that of the first robot of its component.
 
     Attributes:
-        ratio: this robot's distances over the other's, of the same things.
+        ratio: this robot's distances over the first's, of the same things.
         sigma: its standard deviation.
         closures: loop closures that it is the median of.
     """
@@ -46,21 +46,19 @@ class DepthScale:
     closures: int
 
 
-def depth_scales(
-    run: RunFolder, source: Recording, decisions: Iterable[Any]
-) -> dict[tuple[str, str], DepthScale]:
-    """Ratios of all pairs of robots with enough loop closures, by (robot, other), in order of these names.
+def depth_scales(run: RunFolder, source: Recording, decisions: Iterable[Any]) -> dict[str, DepthScale]:
+    """Scales of all robots with enough loop closures with the first of their component, by name.
 
     Args:
         run: the run.
         source: its recording.
         decisions: every duagc.v1.LoopClosureDecision.
     """
-    keyframes: dict[tuple[str, str], set[tuple[int, int]]] = defaultdict(set)
+    keyframes: dict[str, set[tuple[int, int]]] = defaultdict(set)
     for d in decisions:
-        if is_inlier(d) and not same_robot(d.robot, d.peer):
-            (robot, own), (other, theirs) = sorted([(d.robot, d.own_keyframe), (d.peer, d.peer_keyframe)])
-            keyframes[robot, other].add((own, theirs))
+        (first, theirs), (robot, own) = sorted([(d.robot, d.own_keyframe), (d.peer, d.peer_keyframe)])
+        if is_inlier(d) and not same_robot(first, robot) and run.robots[robot].component[0] == first:
+            keyframes[robot].add((theirs, own))
     found = {}
     with ExitStack() as opened:
         logs = {name: opened.enter_context(open_rgbd(source.log(name))) for name in source.robots}
@@ -71,49 +69,46 @@ def depth_scales(
             frame = log.frame(run.robots[robot].keyframes[keyframe].frame_index)
             return extract(frame.color, frame.usable_depth, log.camera, FEATURES, mask=frame.mask)
 
-        for (robot, other), all_ends in sorted(keyframes.items()):
-            if len(all_ends) < FEWEST_CLOSURES:
-                continue
+        for robot, all_ends in sorted(keyframes.items()):
+            first = run.robots[robot].component[0]
             spread = np.linspace(0, len(all_ends) - 1, min(len(all_ends), MOST_CLOSURES))
             ends = [sorted(all_ends)[k] for k in spread.round().astype(int)]
-            pairs = [match_views(features(robot, a), features(other, b), a, b) for a, b in ends]
-            scales = [_log_ratio(pair) for pair in pairs if pair is not None]
-            if len(scales) >= FEWEST_CLOSURES:
-                found[robot, other] = _median(scales)
+            pairs = [match_views(features(first, a), features(robot, b), a, b) for a, b in ends]
+            ratios = [_log_ratio(pair) for pair in pairs if pair is not None]
+            if len(ratios) >= FEWEST_CLOSURES:
+                found[robot] = _median(ratios)
     return found
 
 
-def section(robot: RobotRun, scales: Mapping[tuple[str, str], DepthScale]) -> dict[str, float | Absent]:
-    """What metrics.json says of one robot: its scale relative to that of the first robot of its component.
+def section(robot: RobotRun, scales: Mapping[str, DepthScale]) -> dict[str, float | Absent]:
+    """What metrics.json says of one robot.
 
     Args:
         robot: of the run.
-        scales: of pairs.
+        scales: of all robots, by name.
     """
-    names, first = ("depth_ratio", "sigma_depth_ratio", "depth_ratio_closures"), robot.component[0]
-    scale = scales.get((first, robot.robot))
+    names = ("depth_ratio", "sigma_depth_ratio", "depth_ratio_closures")
+    if (scale := scales.get(robot.robot)) is not None:
+        return dict(zip(names, (scale.ratio, scale.sigma, scale.closures), strict=True))
     if len(robot.component) < 2:
-        return dict.fromkeys(names, Absent("this robot met no other robot"))
-    if first == robot.robot:
-        return dict.fromkeys(names, Absent("the others' cameras are held against this one"))
-    if scale is None:
-        return dict.fromkeys(
-            names, Absent("too few loop closures with the first robot have features in common")
-        )
-    inverse = 1.0 / scale.ratio
-    return dict(zip(names, (inverse, scale.sigma * inverse**2, scale.closures), strict=True))
+        reason = "this robot met no other robot"
+    elif robot.component[0] == robot.robot:
+        reason = "the others' cameras are held against this one"
+    else:
+        reason = "too few loop closures with the first robot have features in common"
+    return dict.fromkeys(names, Absent(reason))
 
 
 def _log_ratio(pair: MatchedPair) -> float:
-    """Logarithm of the spread of the first view's points over that of the second's."""
+    """Logarithm of the spread of the second view's points over that of the first's."""
     spread_a, spread_b = (
         float(np.sum((points - points.mean(axis=0)) ** 2)) for points in (pair.points_a, pair.points_b)
     )
-    return 0.5 * float(np.log(spread_a / spread_b))
+    return 0.5 * float(np.log(spread_b / spread_a))
 
 
-def _median(scales: list[float]) -> DepthScale:
-    values = np.array(scales)
+def _median(log_ratios: list[float]) -> DepthScale:
+    values = np.array(log_ratios)
     median = float(np.median(values))
     sigma = 1.4826 * float(np.median(np.abs(values - median))) / np.sqrt(len(values))
     ratio = float(np.exp(median))
