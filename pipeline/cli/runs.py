@@ -227,13 +227,12 @@ def _say_times(run_folder: Path) -> None:
 
 def _say_advice(run_folder: Path, recording: Path) -> None:
     from duagc.pipeline.recording import Recording
-    from duagc.pipeline.report.advice import calibration_advice, depth_scale_advice
+    from duagc.pipeline.report.advice import advice
     from duagc.pipeline.runs.folder import RunFolder
 
     run = RunFolder(run_folder)
-    said = [calibration_advice(run, Recording(recording)), depth_scale_advice(run)] if run.metrics else []
-    for advice in filter(None, said):
-        say(advice)
+    for said in advice(run, Recording(recording)) if run.metrics else []:
+        say(said)
 
 
 def _print_outputs(run_folder: Path) -> None:

@@ -133,6 +133,13 @@ def measured(decision: Any) -> bool:
     return decision.measured or decision.inliers > 0
 
 
+def follows_moved(decision: Any) -> bool:
+    """Whether a candidate shows something that moved between the recordings of two robots."""
+    from duagc.pipeline.exchange.verification import Verdict
+
+    return bool(decision.verdict == Verdict.SOMETHING_MOVED.value)
+
+
 class Session:
     """The two logs of the exchange of one run; each is read when it is asked for, and once."""
 

@@ -39,6 +39,7 @@ from duagc.pipeline.exchange.loop_closing import (
     can_be_sent,
     join,
 )
+from duagc.pipeline.exchange.moved_things import without_moved_things
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
 from duagc.pipeline.exchange.rectified_search import RectifiedSearch, most_alike
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify, within_view
@@ -322,6 +323,8 @@ class Verifier(LoopClosureProtocol):
         """Pairwise consistency, the relative frame, and the message with the verdict."""
         assert self.peer_keyframes is not None
         self._inject()
+        own, agreeing = self.database.graph.from_first, self.config.consensus.closures
+        self.tried = without_moved_things(self.tried, own, self.peer_keyframes, agreeing)
         self.tried.sort(key=lambda t: (t.candidate.peer_keyframe, t.candidate.own_keyframe))
         closures, consistency = self._consistency()
         outcomes = iter(zip(consistency.keep.tolist(), consistency.reasons, strict=True))

@@ -5,7 +5,7 @@ To compare with, generalized ICP of the two views' points in its place, from the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -38,6 +38,7 @@ class Verdict(Enum):
     FEW_INLIERS = "too few matches agree on one motion"
     NOT_REGISTERED = "registration of the two views failed"
     MOVED = "registration moved far from the motion of the matches"
+    SOMETHING_MOVED = "shows something that moved between the recordings"
     OUTWEIGHED = "lost its weight in the pose consensus"
     ALONE = "kept its weight, but too few others of this pair of robots did"
     UNDECIDED = "other links of the team contradict it, and it is open which are false"
@@ -55,6 +56,7 @@ class Verified:
         detail: with numbers.
         closure: the loop closure, if the candidate was kept.
         tentative: what matched features agree on where registration failed; its information is zero.
+        moved: the motion of something that moved between the two views, if they show one.
     """
 
     verdict: Verdict
@@ -63,6 +65,7 @@ class Verified:
     detail: str = ""
     closure: LoopClosure | None = None
     tentative: LoopClosure | None = None
+    moved: LoopClosure | None = None
 
 
 def within_view(
@@ -125,7 +128,17 @@ def verify(
         config,
         registration=config.registration,
         rng=rng,
+        both=True,
     )
+    if found.another is None:
+        return _judged(candidate, found, config)
+    # what moves between two views is smaller than what does not
+    moved, place = sorted((found, found.another), key=lambda motion: motion.features.spread_m)
+    return replace(_judged(candidate, place, config), moved=_judged(candidate, moved, config).closure)
+
+
+def _judged(candidate: Candidate, found: GeometricVerification, config: VerificationConfig) -> Verified:
+    """The verdict on one motion between two views."""
     verdict, detail = _VERDICTS[found.failure], _detail(found)
     closure = tentative = None
     if found.failure is None:

@@ -22,7 +22,7 @@ from duagc.pipeline.frontend.failure import Reason, free_space_violations
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Level
-from duagc.pipeline.registration.geometric_verification import FeatureJudgment, judge_motion
+from duagc.pipeline.registration.feature_judgment import FeatureJudgment, judge_motion
 
 Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
 

@@ -25,10 +25,10 @@ from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyfram
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.align import reach_factor
+from duagc.pipeline.registration.feature_judgment import judge_motion
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.geometric_verification import (
     features_agree,
-    judge_motion,
     motion_from_features,
 )
 

@@ -21,8 +21,9 @@ from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.align import reach_factor
+from duagc.pipeline.registration.feature_judgment import angles_between, judge_motion
 from duagc.pipeline.registration.features import matches
-from duagc.pipeline.registration.geometric_verification import angles_between, features_agree, judge_motion
+from duagc.pipeline.registration.geometric_verification import features_agree
 
 
 class PoseCheck(Protocol):

@@ -8,14 +8,14 @@ differ in their settings and in what they have of the two views.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
-from duagc.pipeline.geometry import projection, se3, so3
+from duagc.pipeline.geometry import projection, se3
 from duagc.pipeline.registration.align import Registration, reach_factor, register
 from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.matched_points import ransac
@@ -23,7 +23,7 @@ from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.rectified_features import matched_points
 from duagc.pipeline.registration.reference import Reference
 
-INDEPENDENT_FEATURES = 10  # at most as many of the errors of matched points count as independent
+APART = 3.0  # of the limits: a match so far from a motion follows another one
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,11 @@ class FeatureMotion:
     def accepted(self) -> bool:
         """Whether enough matches agree."""
         return self.T_first_second is not None and self.inliers >= self.needed
+
+    @property
+    def spread_m(self) -> float:
+        """Root of the mean squared distance of the points that agree from their mean."""
+        return float(np.sqrt(np.sum(np.var(self.points, axis=0)))) if len(self.points) else 0.0
 
 
 class Failure(Enum):
@@ -98,6 +103,7 @@ class GeometricVerification:
         correction_m: how far registration moved the motion that the features gave, at the camera or at the features,
             whichever is less; 0 before it.
         correction_rad: the same for the rotation.
+        another: of the other motion, if features agree on two.
     """
 
     failure: Failure | None
@@ -107,6 +113,7 @@ class GeometricVerification:
     information: Array
     correction_m: float = 0.0
     correction_rad: float = 0.0
+    another: GeometricVerification | None = None
 
 
 def motion_from_features(
@@ -120,10 +127,7 @@ def motion_from_features(
         config: ratio test, RANSAC, inliers needed.
         rng: draws the samples of RANSAC.
     """
-    pairs = matches(first.descriptors, second.descriptors, config.ratio)
-    points_first = first.points[pairs[:, 0]].astype(np.float64)
-    points_second = second.points[pairs[:, 1]].astype(np.float64)
-    return _motion_of_points(points_first, points_second, config, rng)
+    return _motion_of_points(*matched_features(first, second, config), config, rng)
 
 
 def motion_from_rectified(
@@ -143,6 +147,20 @@ def motion_from_rectified(
     return _motion_of_points(*matched_points(first, second, config.ratio), config, rng)
 
 
+def matched_features(
+    first: Features, second: Features, config: GeometricVerificationConfig
+) -> tuple[Array, Array]:
+    """Points [n, 3], meters, of matched features of two views, each in its own frame.
+
+    Args:
+        first: features of the first view.
+        second: features of the second view.
+        config: ratio test.
+    """
+    pairs = matches(first.descriptors, second.descriptors, config.ratio)
+    return first.points[pairs[:, 0]].astype(np.float64), second.points[pairs[:, 1]].astype(np.float64)
+
+
 def _motion_of_points(
     points_first: Array, points_second: Array, config: GeometricVerificationConfig, rng: np.random.Generator
 ) -> FeatureMotion:
@@ -153,7 +171,24 @@ def _motion_of_points(
     T, agree = ransac(
         points_first, points_second, inlier_m=config.inlier_m, hypotheses=config.hypotheses, rng=rng
     )
-    return FeatureMotion(T, n, int(agree.sum()), _inliers_needed(n, config), points_second[agree])
+    return FeatureMotion(T, n, int(agree.sum()), inliers_needed(n, config), points_second[agree])
+
+
+def _motion_of_others(
+    found: FeatureMotion,
+    points_first: Array,
+    points_second: Array,
+    *,
+    config: GeometricVerificationConfig,
+    rng: np.random.Generator,
+) -> FeatureMotion | None:
+    """The motion of matched points [n, 3] that are far from the one that was found; None if too few agree."""
+    if found.T_first_second is None or not found.accepted:
+        return None
+    apart_m = np.linalg.norm(points_first - se3.transform(found.T_first_second, points_second), axis=-1)
+    others = apart_m > APART * _limit_m(points_first, config)
+    motion = _motion_of_points(points_first[others], points_second[others], config, rng)
+    return replace(motion, matches=len(apart_m)) if motion.accepted else None
 
 
 def features_agree(
@@ -167,94 +202,10 @@ def features_agree(
         T_first_second: the motion, [4, 4].
         config: ratio test, inliers needed.
     """
-    pairs = matches(first.descriptors, second.descriptors, config.ratio)
-    points_first = first.points[pairs[:, 0]].astype(np.float64)
-    moved = se3.transform(T_first_second, second.points[pairs[:, 1]].astype(np.float64))
-    limit_m = config.inlier_m * np.maximum(1.0, points_first[:, 2])
-    agree = np.linalg.norm(points_first - moved, axis=-1) < limit_m
-    return int(agree.sum()) >= _inliers_needed(len(pairs), config)
-
-
-@dataclass(frozen=True)
-class FeatureJudgment:
-    """What matched features of two views say of a motion between them.
-
-    Only matches that agree on one motion count, whatever that motion is.
-
-    Attributes:
-        inliers: number of these.
-        given_rad: median angle between a feature and its partner moved by the given motion.
-        own_rad: the same by the motion that they agree on.
-        T_first_second: [4, 4], that motion.
-        information: [6, 6] of its right tangent.
-    """
-
-    inliers: int
-    given_rad: float
-    own_rad: float
-    T_first_second: Array
-    information: Array
-
-
-def judge_motion(
-    first: Features,
-    second: Features,
-    T_first_second: Array,
-    *,
-    config: GeometricVerificationConfig,
-    rng: np.random.Generator,
-) -> FeatureJudgment | None:
-    """How far apart matched features of two views are at a given motion; None if too few agree on any motion.
-
-    Args:
-        first: features of the first view.
-        second: features of the second view.
-        T_first_second: the given motion, [4, 4].
-        config: ratio test, RANSAC, inliers needed.
-        rng: draws the samples of RANSAC.
-    """
-    pairs = matches(first.descriptors, second.descriptors, config.ratio)
-    if len(pairs) < config.min_inliers:
-        return None
-    points = first.points[pairs[:, 0]].astype(np.float64), second.points[pairs[:, 1]].astype(np.float64)
-    T_own, agree = ransac(*points, inlier_m=config.inlier_m, hypotheses=config.hypotheses, rng=rng)
-    if agree.sum() < _inliers_needed(len(pairs), config):
-        return None
-    ours, theirs = points[0][agree], points[1][agree]
-    given, own = (_median_angle(ours, theirs, T) for T in (T_first_second, T_own))
-    return FeatureJudgment(int(agree.sum()), given, own, T_own, _information(ours, theirs, T_own))
-
-
-def angles_between(points: Array, others: Array) -> Array:
-    """Angles [...] under which a camera sees points and others apart.
-
-    Args:
-        points: [..., 3], in the frame of the camera.
-        others: [..., 3], in the same frame.
-    """
-    across = np.linalg.norm(np.cross(points, others), axis=-1)
-    return np.asarray(np.arctan2(across, np.sum(points * others, axis=-1)))
-
-
-def _median_angle(points_first: Array, points_second: Array, T_first_second: Array) -> float:
-    """Median angle between points and their partners as either view sees them, both views together."""
-    angles = [
-        angles_between(points_first, se3.transform(T_first_second, points_second)),
-        angles_between(points_second, se3.transform(se3.inverse(T_first_second), points_first)),
-    ]
-    return float(np.median(np.concatenate(angles)))
-
-
-def _information(points_first: Array, points_second: Array, T_first_second: Array) -> Array:
-    """Information [6, 6] of a motion fitted to points: of their distances, and few of them are independent.
-
-    Neighboring features share errors of depth, of calibration and of the shutter.
-    """
-    distance = np.linalg.norm(points_first - se3.transform(T_first_second, points_second), axis=-1)
-    variance = max(float(np.mean(distance**2)) / 3, 1e-6)
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(distance), 3, 3)), -so3.hat(points_second)], axis=-1)
-    H = np.einsum("nka,nkb->ab", J, J) / variance
-    return np.asarray(H * min(1.0, INDEPENDENT_FEATURES / len(distance)))
+    points_first, points_second = matched_features(first, second, config)
+    moved = se3.transform(T_first_second, points_second)
+    agree = np.linalg.norm(points_first - moved, axis=-1) < _limit_m(points_first, config)
+    return int(agree.sum()) >= inliers_needed(len(agree), config)
 
 
 def verify(
@@ -264,6 +215,7 @@ def verify(
     *,
     registration: RegistrationConfig,
     rng: np.random.Generator,
+    both: bool = False,
 ) -> GeometricVerification:
     """Verify that two views show one place.
 
@@ -276,15 +228,33 @@ def verify(
         config: limits of all tests.
         registration: settings of the registrations.
         rng: draws the samples of RANSAC.
+        both: verify a second motion as well, on which many of the other features agree: something moved between the
+            views.
 
     Returns:
         The motion with its information, or the first test that failed.
     """
     if first.rectified is None or second.rectified is None:
-        found = motion_from_features(first.features, second.features, config, rng)
+        points = matched_features(first.features, second.features, config)
     else:
-        ours, theirs = (first.features, first.rectified), (second.features, second.rectified)
-        found = motion_from_rectified(ours, theirs, config, rng)
+        points = matched_points(
+            (first.features, first.rectified), (second.features, second.rectified), config.ratio
+        )
+    found = _motion_of_points(*points, config, rng)
+    verified = _verified(found, (first, second), config, registration)
+    other = _motion_of_others(found, *points, config=config, rng=rng) if both else None
+    if other is None:
+        return verified
+    return replace(verified, another=_verified(other, (first, second), config, registration))
+
+
+def _verified(
+    found: FeatureMotion,
+    views: tuple[VerificationView, VerificationView],
+    config: GeometricVerificationConfig,
+    registration: RegistrationConfig,
+) -> GeometricVerification:
+    """What becomes of a motion that features agree on."""
 
     def failed(failure: Failure, result: Registration | None = None) -> GeometricVerification:
         return GeometricVerification(failure, found, result, np.eye(4), np.zeros((6, 6)))
@@ -294,7 +264,7 @@ def verify(
     if not found.accepted:
         return failed(Failure.FEW_INLIERS)
     guess = found.T_first_second
-    measured = _registered(first, second, guess, config=config, registration=registration)
+    measured = _registered(*views, guess, config=config, registration=registration)
     if not measured:
         raise ValueError("geometric verification needs samples of one view and images of the other")
     result, T, information = measured[0].result, measured[0].T_first_second, measured[0].information
@@ -304,7 +274,7 @@ def verify(
     if not all(one.shares_enough for one in measured):
         return failed(Failure.LOW_OVERLAP, result)
     apart_m, apart_rad = se3.distance(T, measured[-1].T_first_second)
-    reach = reach_factor(max(first.median_depth_m, second.median_depth_m))
+    reach = reach_factor(max(view.median_depth_m for view in views))
     if apart_m > config.max_disagreement_m * reach or apart_rad > config.max_disagreement_rad:
         return failed(Failure.DIRECTIONS_DISAGREE, result)
     moved_m, moved_rad = (float(d) for d in se3.distance(guess, T))
@@ -373,5 +343,16 @@ def _shares_enough(
     return projection.covered(points, level.camera, level.inverse_depth, normals) >= config.min_covered
 
 
-def _inliers_needed(count: int, config: GeometricVerificationConfig) -> int:
+def _limit_m(points: Array, config: GeometricVerificationConfig) -> Array:
+    """Distance [n] below which a match of points [n, 3] agrees with a motion."""
+    return np.asarray(config.inlier_m * np.maximum(1.0, points[:, 2]))
+
+
+def inliers_needed(count: int, config: GeometricVerificationConfig) -> int:
+    """Matches that must agree on one motion.
+
+    Args:
+        count: of all matches.
+        config: at least how many, and which share.
+    """
     return max(config.min_inliers, int(np.ceil(config.min_inlier_share * count)))

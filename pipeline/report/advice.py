@@ -1,8 +1,11 @@
-"""What a run that was measured advises its user to try."""
+"""What a run that was measured says of its recording, and advises its user to try."""
 
 from __future__ import annotations
 
+from collections import Counter
+
 from duagc.pipeline.base.component_names import robot_of
+from duagc.pipeline.evaluation.network import Session, follows_moved
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.runs.folder import RunFolder
 
@@ -14,6 +17,18 @@ With exact cameras they are 0.15 to 0.65 px apart, with those that datasets stat
 FEWEST_PAIRS = 10
 CERTAIN_SIGMAS = 4.0
 """Scales of depth that differ by more standard deviations are said to."""
+
+
+def advice(run: RunFolder, source: Recording) -> list[str]:
+    """Sentences on what is wrong with the recording, most often none.
+
+    Args:
+        run: that was measured.
+        source: its recording.
+    """
+    return [
+        said for said in (calibration_advice(run, source), depth_scale_advice(run), moved_advice(run)) if said
+    ]
 
 
 def calibration_advice(run: RunFolder, source: Recording) -> str:
@@ -57,6 +72,26 @@ def depth_scale_advice(run: RunFolder) -> str:
     return (
         f"Scales of depth differ: {', '.join(off)} of the first robot, of the same things; "
         "poses between the robots are wrong by as much, and `depth_scale` at conversion corrects it."
+    )
+
+
+def moved_advice(run: RunFolder) -> str:
+    """A sentence that names robots between whose recordings something moved, by which they are not joined.
+
+    Args:
+        run: that was measured.
+    """
+    moved = Counter(
+        f"{min(d.robot, d.peer)} and {max(d.robot, d.peer)}"
+        for d in Session(run).loop_closures
+        if follows_moved(d)
+    )
+    if not moved:
+        return ""
+    pairs = ", ".join(f"{pair} ({count})" for pair, count in sorted(moved.items()))
+    return (
+        f"Something moved between the recordings of {pairs} and stands in their maps where each saw it; "
+        "loop closures that follow it, so many, are left out."
     )
 
 

@@ -19,7 +19,7 @@ from duagc.pipeline.evaluation.paths import Path3, paths, top_view_axes
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import figures, labels, pictures
-from duagc.pipeline.report.advice import calibration_advice, depth_scale_advice
+from duagc.pipeline.report.advice import advice
 from duagc.pipeline.report.cards import cards
 from duagc.pipeline.report.coverage import coverage_content
 from duagc.pipeline.report.renders import rendered_views
@@ -181,8 +181,7 @@ def _paths_content(run: RunFolder, source: Recording, metrics: dict[str, Any]) -
             if all(isinstance(way.true, Absent) for way in shown)
             else " Ground truth is missing for some robots."
         )
-    for advice in filter(None, (calibration_advice(run, source), depth_scale_advice(run))):
-        lead += f" {advice}"
+    lead = " ".join([lead, *advice(run, source)])
     columns = labels.without_empty(labels.ROBOT, list(metrics["robots"].values()))
     return {
         "paths_lead": lead,

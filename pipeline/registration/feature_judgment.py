@@ -1,0 +1,97 @@
+"""What matched features of two views say of a motion between them that was found in another way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.registration import GeometricVerificationConfig
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.registration.features import Features
+from duagc.pipeline.registration.geometric_verification import inliers_needed, matched_features
+from duagc.pipeline.registration.matched_points import ransac
+
+INDEPENDENT_FEATURES = 10  # at most as many of the errors of matched points count as independent
+
+
+@dataclass(frozen=True)
+class FeatureJudgment:
+    """What matched features of two views say of a motion between them.
+
+    Only matches that agree on one motion count, whatever that motion is.
+
+    Attributes:
+        inliers: number of these.
+        given_rad: median angle between a feature and its partner moved by the given motion.
+        own_rad: the same by the motion that they agree on.
+        T_first_second: [4, 4], that motion.
+        information: [6, 6] of its right tangent.
+    """
+
+    inliers: int
+    given_rad: float
+    own_rad: float
+    T_first_second: Array
+    information: Array
+
+
+def judge_motion(
+    first: Features,
+    second: Features,
+    T_first_second: Array,
+    *,
+    config: GeometricVerificationConfig,
+    rng: np.random.Generator,
+) -> FeatureJudgment | None:
+    """How far apart matched features of two views are at a given motion; None if too few agree on any motion.
+
+    Args:
+        first: features of the first view.
+        second: features of the second view.
+        T_first_second: the given motion, [4, 4].
+        config: ratio test, RANSAC, inliers needed.
+        rng: draws the samples of RANSAC.
+    """
+    points = matched_features(first, second, config)
+    if len(points[0]) < config.min_inliers:
+        return None
+    T_own, agree = ransac(*points, inlier_m=config.inlier_m, hypotheses=config.hypotheses, rng=rng)
+    if agree.sum() < inliers_needed(len(agree), config):
+        return None
+    ours, theirs = points[0][agree], points[1][agree]
+    given, own = (_median_angle(ours, theirs, T) for T in (T_first_second, T_own))
+    return FeatureJudgment(int(agree.sum()), given, own, T_own, _information(ours, theirs, T_own))
+
+
+def angles_between(points: Array, others: Array) -> Array:
+    """Angles [...] under which a camera sees points and others apart.
+
+    Args:
+        points: [..., 3], in the frame of the camera.
+        others: [..., 3], in the same frame.
+    """
+    across = np.linalg.norm(np.cross(points, others), axis=-1)
+    return np.asarray(np.arctan2(across, np.sum(points * others, axis=-1)))
+
+
+def _median_angle(points_first: Array, points_second: Array, T_first_second: Array) -> float:
+    """Median angle between points and their partners as either view sees them, both views together."""
+    angles = [
+        angles_between(points_first, se3.transform(T_first_second, points_second)),
+        angles_between(points_second, se3.transform(se3.inverse(T_first_second), points_first)),
+    ]
+    return float(np.median(np.concatenate(angles)))
+
+
+def _information(points_first: Array, points_second: Array, T_first_second: Array) -> Array:
+    """Information [6, 6] of a motion fitted to points: of their distances, and few of them are independent.
+
+    Neighboring features share errors of depth, of calibration and of the shutter.
+    """
+    distance = np.linalg.norm(points_first - se3.transform(T_first_second, points_second), axis=-1)
+    variance = max(float(np.mean(distance**2)) / 3, 1e-6)
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(distance), 3, 3)), -so3.hat(points_second)], axis=-1)
+    H = np.einsum("nka,nkb->ab", J, J) / variance
+    return np.asarray(H * min(1.0, INDEPENDENT_FEATURES / len(distance)))
