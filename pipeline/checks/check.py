@@ -20,6 +20,7 @@ from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import MotionPrior, Recording, RgbdLog, log_metadata, open_rgbd
 from duagc.pipeline.recording.names import DIGEST_RECORD, is_mcap
 from duagc.pipeline.recording.read import LogFile, verify
+from duagc.schemas.topics import COLOR
 
 __all__ = ["Finding", "Report", "Severity", "check", "check_registration", "format_report"]
 
@@ -50,6 +51,7 @@ def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = N
     report = Report(str(path))
     recording = None if path.is_file() else Recording(path)
     sights: dict[str, images.Sight] = {}
+    colors: dict[str, images.Repeats] = {}
     for robot in recording.robots if recording else [""]:
         log = None
         try:
@@ -57,10 +59,11 @@ def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = N
             with open_rgbd(log) as rgbd:
                 if recording:
                     rgbd.check_robot(robot)
-                _check_robot(report, recording, rgbd, sights, config=config)
+                _check_robot(report, recording, rgbd, sights, colors=colors, config=config)
         except DuagError as error:
             report.findings.append(_unreadable(robot, error, _remedy(log)))
     report.findings += images.check_colors(sights, config.images)
+    report.findings += images.check_copies(colors)
     speed = measured.MachineSpeed() if store is None else measured.speed_of(Path(store))
     report.estimate = estimate.estimate(report.robots, speed.ratios) | {"measured_stages": speed.stages}
     report.findings += estimate.check_disk(path.parent, report.estimate["bytes"])
@@ -125,6 +128,7 @@ def _check_robot(
     log: RgbdLog,
     sights: dict[str, images.Sight],
     *,
+    colors: dict[str, images.Repeats],
     config: ChecksConfig,
 ) -> None:
     robot, add = log.robot, report.findings.extend
@@ -133,6 +137,7 @@ def _check_robot(
             add(_check_digest(recording, robot, file))
             add(_check_clock(recording, robot))
         topics = images.read_repeats(file, robot)
+    colors[robot] = topics[COLOR.of(robot)]
     for topic, repeats in topics.items():
         add(stamps.check_stamps(robot, topic, repeats.stamps_ns, config.times))
         add(images.check_repeats(robot, topic, repeats, config.images))

@@ -23,15 +23,30 @@ from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics as topic_table
 
 FEW_FRAMES = 0.1  # of a recording: so many with saturated or far depth are enough to be reported
+SAME_IMAGES, SAME_SHARE = (
+    2,
+    0.05,
+)  # more color images in common, and a larger share of the fewer: one recording twice
 BINS = 8  # of a color histogram, per channel
 TAKE_FOR_NONE = "let the converter take it for none; `convert ros`: --set farthest_m=METERS"
 
 
 @dataclass
 class Repeats:
-    """How often the images of a topic come again. stamps_ns: publish times in the order of the log."""
+    """How often the images of a topic come again.
+
+    Attributes:
+        stamps_ns: publish times in the order of the log.
+        digests: of all images.
+        empty: images of nothing but zeros: depth that is unknown everywhere. They repeat nothing.
+        repeated: images that are the one before once more.
+        longest: most of them in a row, the first one included.
+        other_stamps: images that state another time than their message.
+    """
 
     stamps_ns: list[int] = field(default_factory=list)
+    digests: set[int] = field(default_factory=set)
+    empty: int = 0
     repeated: int = 0
     longest: int = 1
     other_stamps: int = 0
@@ -42,11 +57,14 @@ class Repeats:
         """Take in the next image."""
         image = record.proto()
         digest = zlib.crc32(image.data)
-        same = digest == self._last and len(self.stamps_ns) > 0
+        empty = not image.data.strip(b"\0")
+        self.empty += empty
+        same = digest == self._last and len(self.stamps_ns) > 0 and not empty
         self._run = self._run + 1 if same else 1
         self.repeated += same
         self.longest, self._last = max(self.longest, self._run), digest
         self.stamps_ns.append(record.publish_time_ns)
+        self.digests.add(digest)
         self.other_stamps += unpack_stamp(image) != record.publish_time_ns
 
 
@@ -61,8 +79,17 @@ def read_repeats(log: LogFile, robot: str) -> dict[str, Repeats]:
 
 
 def check_repeats(robot: str, topic: str, repeats: Repeats, config: ImageChecks) -> Iterator[Finding]:
-    """Findings about images that come again."""
+    """Findings about images that come again, and about empty ones."""
     count = len(repeats.stamps_ns)
+    if 0 < repeats.empty < count:
+        yield Finding(
+            Severity.WARNING if repeats.empty > FEW_FRAMES * count else Severity.NOTE,
+            "depth",
+            robot,
+            f"{repeats.empty} of {count} images of {topic} have no depth at all",
+            "some depth in every image",
+            "what is nearer or farther than the sensor measures has none",
+        )
     if repeats.other_stamps:
         yield Finding(
             Severity.WARNING,
@@ -82,6 +109,28 @@ def check_repeats(robot: str, topic: str, repeats: Repeats, config: ImageChecks)
             "new images",
             "the camera stood still or its driver was stuck" if stuck else "",
         )
+
+
+def check_copies(colors: Mapping[str, Repeats]) -> Iterator[Finding]:
+    """Pairs of robots that have color images in common, byte for byte: one recording was given twice.
+
+    Args:
+        colors: color images by robot.
+    """
+    for a, b in combinations(sorted(colors), 2):
+        same, fewer = (
+            len(colors[a].digests & colors[b].digests),
+            min(len(c.digests) for c in (colors[a], colors[b])),
+        )
+        if same > max(SAME_IMAGES, SAME_SHARE * fewer):
+            yield Finding(
+                Severity.ERROR,
+                "copies",
+                b,
+                f"{same} of its color images are those of {a}, byte for byte",
+                "a recording of its own",
+                "what one camera saw once would count twice",
+            )
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,15 @@ def half_depth(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
             yield record, message, publish_ns
 
 
+def near(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Every fifth depth image is empty, as of what is nearer than the sensor measures; then ten in a row."""
+    depths = [record.log_time_ns for record in records if record.topic == DEPTH]
+    for record, message, publish_ns in nothing(records):
+        if record.topic == DEPTH and ((k := depths.index(record.log_time_ns)) % 5 == 0 or 10 < k < 20):
+            message.data = bytes(len(message.data))
+        yield record, message, publish_ns
+
+
 FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
     "scale x5": (nothing, {"scale": 5}, "error", "depth scale"),
     "scale x0.2": (nothing, {"scale": 0.2}, "error", "depth scale"),
@@ -195,6 +204,7 @@ FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
     "dark": (dark(1), {}, "error", "light"),
     "mostly dark": (dark(0.9), {}, "warning", "light"),
     "no depth": (no_depth, {}, "error", "depth"),
+    "some without depth": (near, {}, "warning", "depth"),
     "half the depth": (half_depth, {}, "warning", "pairs"),
 }
 
@@ -226,6 +236,31 @@ def test_a_sound_recording_raises_no_alarm(sound: Path, tmp_path: Path) -> None:
     assert check.check(sound).plain() == report.plain()
     again = check.check(planted(sound, tmp_path / "rec", nothing))  # the metadata of the log are lost
     assert [f.check for f in again.findings] == ["digest"]
+
+
+def test_images_without_depth_are_no_repeats(sound: Path, tmp_path: Path) -> None:
+    found = check.check(planted(sound, tmp_path / "rec", near)).findings
+    assert any(f"12 of {FRAMES} images" in f.found and "no depth at all" in f.found for f in found)
+    assert not [f for f in found if f.check == "repeats"]
+
+
+def test_a_recording_given_twice_is_an_error(sound: Path, tmp_path: Path) -> None:
+    """The same images by another robot, at other times."""
+    copy = tmp_path / "rec"
+    shutil.copytree(sound, copy)
+    with LogWriter(copy / "alpha.mcap", "alpha") as log:
+        log.channel(topics.DEPTH.of("alpha"), topics.DEPTH.schema, {"depth_scale": "0.0002"})
+        for record in read_log(sound / "bravo.mcap"):
+            message = record.proto()
+            if record.topic in (COLOR, DEPTH):
+                message.timestamp.FromNanoseconds(record.publish_time_ns + 10**9)
+            times = record.log_time_ns + 10**9, record.publish_time_ns + 10**9
+            log.write(record.topic.replace("bravo", "alpha"), message, *times)
+    report = check.check(copy)
+    copies = [f for f in report.findings if f.check == "copies"]
+    assert [f.robot for f in copies] == ["bravo"], check.format_report(report)
+    assert f"{FRAMES} of its color images are those of alpha" in copies[0].found
+    assert not report.sound
 
 
 def seldom_depth(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
