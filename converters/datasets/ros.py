@@ -224,7 +224,8 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
             written.add(depth_ns)
         if check.needs(index, T) and (picture.depth is not None or derived):
             at_depth = None if depth_ns is None else source.true_pose(pairs[stamp_ns])
-            check.add(index, source.depth_m(picture), T if at_depth is None else at_depth)
+            T_depth = T if at_depth is None else at_depth
+            check.add(index, source.depth_m(picture), T_depth, picture.depth_sigma_m)
         empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))
     if len(cut) == len(pairs):
         raise cut[0]

@@ -11,6 +11,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import visible
+from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
 
 GAP = 10  # frames
 PAIRS = 8
@@ -36,15 +37,27 @@ class ReprojectionCheck:
         self._unmoved: list[NDArray[np.float64]] = []
         self._depths: list[NDArray[np.float64]] = []
         self._noise: list[NDArray[np.float64]] = []
+        self._stated: list[NDArray[np.float64]] = []
 
     def needs(self, index: int, T_world_camera: NDArray[np.float64] | None) -> bool:
         """Whether frame `index` is compared with another."""
         return T_world_camera is not None and (index in self._second or index in self._second.values())
 
     def add(
-        self, index: int, depth_m: NDArray[np.float64], T_world_camera: NDArray[np.float64] | None
+        self,
+        index: int,
+        depth_m: NDArray[np.float64],
+        T_world_camera: NDArray[np.float64] | None,
+        sigma_m: NDArray[np.floating] | None = None,
     ) -> None:
-        """Take frame `index`: depth [H, W] (m, 0 = none) and its pose, None where there is none."""
+        """Take a frame.
+
+        Args:
+            index: of the frame.
+            depth_m: [H, W], 0 = none.
+            T_world_camera: [4, 4]; None: there is none.
+            sigma_m: [H, W], standard deviation of the depth where the sensor states it: neighbors may share errors.
+        """
         if T_world_camera is None:
             return
         if index in self._second.values():
@@ -52,6 +65,8 @@ class ReprojectionCheck:
         if index in self._second and self._second[index] in self._kept:
             first, T_world_first = self._kept.pop(self._second[index])
             self._compare(first, T_world_first, depth_m, T_world_camera)
+            if sigma_m is not None:
+                self._stated.append(sigma_m[depth_m > 0].astype(np.float64))
 
     def _compare(
         self,
@@ -88,7 +103,9 @@ class ReprojectionCheck:
         found: dict[str, Any] = {"reprojection_median_m": residual, "median_depth_m": depth}
         if residual <= max_ratio * depth:
             return found
-        noise = _median(self._noise)
+        noise = max(
+            _median(self._noise), np.sqrt(2) / MAD_TO_SIGMA * _median(self._stated)
+        )  # of a difference
         wrong = _without(residual, noise)
         if wrong <= max_ratio * depth:
             return found

@@ -23,7 +23,15 @@ from duagc.converters.logs.cameras import (
 )
 from duagc.converters.logs.choice import Chooser
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
-from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
+from duagc.converters.logs.derived import (
+    Derived,
+    Picture,
+    Stereo,
+    eyes_apart,
+    some_pairs,
+    stereo_of,
+    sweeps_of,
+)
 from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
 from duagc.converters.logs.files import Log, is_own_log
 from duagc.converters.logs.frames import TF_TYPES, Transforms, frame_name
@@ -335,9 +343,7 @@ class RobotLog:
             settings = settings.model_copy(update={"association": "official"})
         found = associate(listed[self.color], listed[self.depth], settings)
         if not found:
-            away = nearest_s(
-                [d.stamp_ns for d in listed[self.depth]], [c.stamp_ns for c in listed[self.color]]
-            )
+            away = nearest_s(*([image.stamp_ns for image in listed[t]] for t in (self.depth, self.color)))
             other_clock = away > LONGEST_WAIT_S and settings.time_source == "header"
             remedy = "time_source=log" if other_clock else "max_difference_s=SECONDS"
             if not other_clock and settings.keeps_depth_time:
@@ -353,6 +359,10 @@ class RobotLog:
             end = "followed by color" if kept else "left out"
             self.warnings.append(
                 f"{len(alone)} of {len(listed[self.color])} color images have no depth near in time; {end}"
+            )
+        if settings.depth_from == "stereo":
+            self.warnings += eyes_apart(
+                [(c.stamp_ns, d.stamp_ns) for c, d in found], (self.color, self.depth)
             )
         pairs |= dict.fromkeys(alone if kept else ())
         if min(pairs) + self.shift_ns < 0:

@@ -57,13 +57,16 @@ def calibrated(info: Any, R: np.ndarray, P: np.ndarray) -> Any:
     return info
 
 
-def stereo_log(folder: Path, stated: str, broken: Mapping[int, bytes] | None = None) -> Path:
+def stereo_log(
+    folder: Path, stated: str, broken: Mapping[int, bytes] | None = None, apart_ns: int = 1_000_000
+) -> Path:
     """A bag of a pair.
 
     Args:
         folder: for the log.
         stated: how ("p", "rect", "tf", "option", "wrong", "none") the right camera's place is.
         broken: by number of the frame, what is recorded instead of the right image; all are compressed then.
+        apart_ns: stamps of the right images after those of the left.
     """
     r = Ros(2)
     D = [(*D_LEFT, 0.0), (*D_RIGHT, 0.0)]
@@ -92,7 +95,7 @@ def stereo_log(folder: Path, stated: str, broken: Mapping[int, bytes] | None = N
         if stated == "rect":
             images = [rig.rectify_left(images[0]), rig.rectify_right(images[1])]
         for side, frame, image in zip(("left", "right"), "lr", images, strict=True):
-            late = 0 if side == "left" else 1_000_000
+            late = 0 if side == "left" else apart_ns
             message, topic = r.image(at + late, frame, image, "rgb8"), f"/eyes/{side}/{name}"
             if broken is not None:
                 data = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
@@ -143,6 +146,16 @@ def test_broken_images_of_a_pair_cost_themselves(tmp_path: Path) -> None:
     log = stereo_log(tmp_path, "tf", dict.fromkeys(range(FRAMES), no_jpeg))
     with pytest.raises(DuagError, match="406 bytes of rgb8, expected an image"):
         registry.convert("ros", log, tmp_path / "rec2", options=options)
+
+
+@pytest.mark.parametrize(("apart_ns", "said"), [(0, False), (1_000_000, False), (5_000_000, True)])
+def test_a_pair_that_was_not_taken_at_once_is_said(tmp_path: Path, apart_ns: int, said: bool) -> None:
+    options = ["depth_from=stereo", "min_depth_m=1.5", "max_relative_sigma=0.1"]
+    log = stereo_log(tmp_path, "p", apart_ns=apart_ns)
+    registry.convert("ros", log, tmp_path / "rec", options=options)
+    warnings = Recording(tmp_path / "rec").description["warnings"]
+    words = "/eyes/left/image_raw and /eyes/right/image_raw are 5.0 ms apart (median)"
+    assert any(words in text for text in warnings) == said, warnings
 
 
 def test_a_pair_whose_rows_do_not_meet_is_refused(tmp_path: Path) -> None:

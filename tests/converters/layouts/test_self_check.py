@@ -12,13 +12,24 @@ CAMERA = PinholeCamera(80, 60, 70.0, 70.0, 39.5, 29.5)
 FRAMES = 30
 
 
-def checked(scale: float, noise_m: float = 0.0) -> ReprojectionCheck:
-    """A camera that goes 5 cm a frame toward a wall at 4 m, by poses that say it goes so many times as far."""
+def checked(
+    scale: float, noise_m: float = 0.0, shared_m: float = 0.0, stated: bool = False
+) -> ReprojectionCheck:
+    """A camera that goes 5 cm a frame toward a wall at 4 m, by poses that say it goes so many times as far.
+
+    Args:
+        scale: so many times.
+        noise_m: standard deviation of a pixel's depth.
+        shared_m: of an error that all pixels of a frame share.
+        stated: the sensor states the latter.
+    """
     check, rng = ReprojectionCheck(CAMERA, FRAMES), np.random.default_rng(0)
     for k in range(FRAMES):
         pose = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, scale * 0.05 * k])
         if check.needs(k, pose):
-            check.add(k, 4.0 - 0.05 * k + noise_m * rng.standard_normal((60, 80)), pose)
+            depth_m = 4.0 - 0.05 * k + noise_m * rng.standard_normal((60, 80))
+            sigma_m = np.full(depth_m.shape, shared_m) if stated else None
+            check.add(k, depth_m + shared_m * rng.standard_normal(), pose, sigma_m)
     return check
 
 
@@ -50,3 +61,12 @@ def test_noise_of_the_depth_is_no_fault_of_the_poses() -> None:
 def test_noise_hides_no_other_convention(scale: float) -> None:
     with pytest.raises(DuagError, match="do not belong together"):
         checked(scale, noise_m=0.2).result("rec")
+
+
+def test_errors_that_neighbors_share_are_explained_by_the_noise_that_the_sensor_states() -> None:
+    assert checked(1.0, shared_m=0.3).result("rec")["rough"]
+    rows = checked(1.0, shared_m=0.3, stated=True).result("rec")
+    assert rows["reprojection_median_m"] > 0.05 * rows["median_depth_m"]
+    assert "rough" not in rows
+    with pytest.raises(DuagError, match="do not belong together"):
+        checked(-1.0, shared_m=0.3, stated=True).result("rec")
