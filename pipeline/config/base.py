@@ -29,6 +29,11 @@ class Config(BaseModel):
     )
 
     @classmethod
+    def summary(cls) -> str:
+        """The first paragraph of what the section says of itself; "" if it says nothing."""
+        return inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0]
+
+    @classmethod
     def documentation(cls) -> dict[str, str]:
         """The text below each setting of the section, by its name; read from the source when somebody asks.
 
@@ -261,13 +266,13 @@ def _fill(table: Any, config: Config) -> None:
             continue
         for line in documentation.get(name, "").splitlines():
             table.add(tomlkit.comment(line.strip()))
-        if value is None:  # TOML has no null; leaving a setting out means its default, which is None
+        if value is None:  # TOML has no null; left out, a setting has its default, which is None
             table.add(tomlkit.comment(f"{name} is not set"))
             continue
         table.add(name, tomlkit.item(_plain(value)))
     for name, section in sections:
         inner = tomlkit.table()
-        if type(section).__doc__:
-            inner.add(tomlkit.comment(str(type(section).__doc__).strip().splitlines()[0]))
+        for line in section.summary().splitlines():
+            inner.add(tomlkit.comment(line))
         _fill(inner, section)
         table.add(name, inner)

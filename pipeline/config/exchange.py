@@ -75,9 +75,9 @@ class VerificationConfig(GeometricVerificationConfig):
     """Points with normal and intensity of the neighbor's keyframe used by the registration."""
     min_overlap: float = Field(default=0.2, ge=0.0, le=1.0)
     """Overlap that the registration must find, of what the own camera can see of the neighbor's samples."""
-    min_covered: float | None = Field(default=0.6, gt=0.0, le=1.0)
-    """Share of the own image in which the neighbor's samples must be seen for less overlap to be enough; None: no share
-    is."""
+    min_covered: float = Field(default=0.6, gt=0.0)
+    """Share of the own image in which the neighbor's samples must be seen for less overlap to be enough; above 1: no
+    share is."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)
     """Largest translation by which the registration may change what RANSAC found: of the camera or, if less, of the
     matches that agree."""

@@ -2,7 +2,7 @@
 
 from typing import Literal, NamedTuple
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.training import DepthKind, LearningRates, MapLossConfig, SparseStepsConfig
@@ -175,10 +175,10 @@ class FusionConfig(Config):
     that are trained on."""
     most_final: int | None = Field(default=None, ge=1)
     """Most Gaussians that a start by `drawn` has; None: as many as the fused map."""
-    finer: float | None = Field(default=1.3, ge=1.0)
+    finer: float = Field(default=1.3, ge=0.0)
     """In the final map a peer's Gaussians replace own ones where the peer's keyframes saw the surface at so many times
-    the resolution of own ones; None: never. With coverage = overlap, or max_added, nothing is replaced or begun by
-    `drawn`."""
+    the resolution of own ones, at least 1; 0: never. With coverage = overlap, or max_added, nothing is replaced or
+    begun by `drawn`."""
     own_pixel_steps: int = Field(default=3, ge=0)
     """Gauss-Newton steps on the opacities of imported Gaussians, by the robot's own images; 0: their owners' values."""
     added_need_information: bool = True
@@ -188,6 +188,13 @@ class FusionConfig(Config):
     finetune: FinetuneConfig = FinetuneConfig()
     max_added: int | None = Field(default=None, ge=0)
     """Most Gaussians of peers that are imported, those of most position information first."""
+
+    @field_validator("finer")
+    @classmethod
+    def _finer_or_never(cls, finer: float) -> float:
+        if 0.0 < finer < 1.0:
+            raise ValueError(f"fusion.finer is {finer:g}, expected 0 or at least 1")
+        return finer
 
     @property
     def imports_all(self) -> bool:

@@ -220,7 +220,7 @@ def _finetuned(
         if from_peers and context.config.final_start == "drawn":
             seen = [*views[: own.keyframes], *shown]
             start = most_drawn(fused, usable, valid.pairs, context, robot=own.robot, views=seen)
-        elif from_peers and context.config.finer is not None:
+        elif from_peers and context.config.finer:
             start = from_finest_views(
                 fused,
                 usable,

@@ -1,13 +1,20 @@
 """Configuration files: round trip, overrides, and errors that name what is wrong."""
 
+from importlib import import_module
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from duagc.converters.registry import DATASETS
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.batch.suite import SuiteFile
+from duagc.pipeline.comparison.tolerances import Tolerance
 from duagc.pipeline.config.base import Config, differing_settings, dump_config, load_config
+from duagc.pipeline.config.checks import ChecksConfig
 from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.experiments.rule import ExperimentFile
 
 
 class Link(Config):
@@ -35,6 +42,53 @@ def test_dump_and_load_round_trip(tmp_path: Path) -> None:
     assert "# Per packet, independent." in text
     (tmp_path / "c.toml").write_text(text)
     assert load_config(Whole, tmp_path / "c.toml") == config
+
+
+def optional_settings() -> list[tuple[type[Config], str]]:
+    """Settings that may be None, of every section: of runs, checks, converters, experiments, suites and tolerances."""
+    for module in DATASETS.values():
+        import_module(module)
+    found: list[tuple[type[Config], str]] = []
+    classes: list[type[Config]] = [RunConfig, ChecksConfig, ExperimentFile, SuiteFile, Tolerance, Config]
+    for kind in classes:
+        classes += [
+            c for c in kind.__subclasses__() if c.__module__.startswith("duagc.") and c not in classes
+        ]
+        found += [
+            (kind, n) for n, field in kind.model_fields.items() if type(None) in get_args(field.annotation)
+        ]
+    return found
+
+
+def test_a_setting_that_may_be_none_is_none_by_default() -> None:
+    """TOML has no null: a setting that is left out has its default, so only such a None is read as it was written."""
+    optional = optional_settings()
+    assert len({kind for kind, _ in optional}) >= 10
+    assert [f"{k.__name__}.{n}" for k, n in optional if k.model_fields[n].default is not None] == []
+
+
+def test_what_is_turned_off_is_read_as_it_was_written(tmp_path: Path) -> None:
+    off = ["fusion.finer=0", "exchange.verification.min_covered=1.1"]
+    config = load_config(RunConfig, overrides=off)
+    (tmp_path / "c.toml").write_text(dump_config(config))
+    assert load_config(RunConfig, tmp_path / "c.toml") == config
+    with pytest.raises(DuagError, match=r"fusion\.finer is 0\.5, expected 0 or at least 1"):
+        load_config(RunConfig, overrides=["fusion.finer=0.5"])
+
+
+def test_a_section_is_introduced_by_its_first_paragraph() -> None:
+    class Wheel(Config):
+        """What others
+        are made of.
+
+        And more.
+        """
+
+        radius_m: float = 0.1
+        """Of the tire."""
+
+    assert Wheel.summary() == "What others\nare made of."
+    assert Whole.summary() == "All of it."
 
 
 def test_overrides_win_over_the_file(tmp_path: Path) -> None:

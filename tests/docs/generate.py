@@ -42,7 +42,7 @@ BEGIN, END = "<!-- generated:begin -->", "<!-- generated:end -->"
 
 def cell(text: str) -> str:
     """Text that stands in one cell of a Markdown table."""
-    return " ".join(text.split()).replace("|", "\\|")
+    return _one_line(text).replace("|", "\\|")
 
 
 def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
@@ -151,20 +151,24 @@ def _sections(config: Config, path: str) -> Iterator[str]:
             inner.append((f"{path}.{name}".lstrip("."), value))
         else:
             rows.append(_row(type(config), name, value))
-    summary = (type(config).__doc__ or "").strip().splitlines()
     if rows:
         if path:
             yield f"## {path}\n"
-        yield from (f"{line}\n" for line in summary[:1])
+        if config.summary():
+            yield f"{_one_line(config.summary())}\n"
         yield table(("key", "default", "type", "meaning"), rows)
     for name, field in type(config).model_fields.items():
         for kind in typing.get_args(field.annotation):
             if inspect.isclass(kind) and issubclass(kind, Config):
                 yield f"## {path}.{name}, each\n"
-                yield f"{(kind.__doc__ or '').strip().splitlines()[0]}\n"
+                yield f"{_one_line(kind.summary())}\n"
                 yield _table_of(kind)
     for name, section in inner:
         yield from _sections(section, name)
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
 
 
 def _table_of(model: type[Config]) -> str:
@@ -225,6 +229,9 @@ def _type_name(kind: Any) -> str:
     if typing.get_origin(kind) is tuple:
         inner = [k for k in typing.get_args(kind) if k is not ...]
         return "list of " + ", ".join(dict.fromkeys(_type_name(k) for k in inner))
+    if typing.get_origin(kind) is dict:
+        key, value = typing.get_args(kind)
+        return f"table of {_type_name(value)}, by {'name' if key is str else _type_name(key)}"
     choices = ["not set" if k is type(None) else _type_name(k) for k in typing.get_args(kind)]
     return " or ".join(choices) if choices else str(kind)
 

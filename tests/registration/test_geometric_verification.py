@@ -125,7 +125,7 @@ def test_what_is_all_of_a_nearer_view_is_enough_for_robots() -> None:
         return verify(first, second, config, registration=config.registration, rng=rng())
 
     robots = VerificationConfig()
-    assert found(robots.model_copy(update={"min_covered": None})).failure is Failure.LOW_OVERLAP
+    assert found(robots.model_copy(update={"min_covered": 1.1})).failure is Failure.LOW_OVERLAP
     enough = found(robots)
     assert enough.failure is None
     assert enough.registration is not None
