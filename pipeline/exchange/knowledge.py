@@ -28,7 +28,7 @@ class Incoming:
     Attributes:
         owner: index of the robot whose evidence it is.
         provider: index of the neighbor.
-        chunks: those that are here, by message.
+        chunks: those that are here, each checked on its arrival.
     """
 
     owner: int
@@ -58,19 +58,23 @@ class Knowledge:
         self.pairs_bytes: dict[tuple[int, int], bytes] = {}
 
     def take_evidence(self, provider: int, message: int, payload: bytes, complete: bool) -> int | None:
-        """Take a chunk, or the complete message. Returns the owner if its evidence is here completely."""
+        """Take a chunk, or the complete message. Returns the owner if its evidence is here completely.
+
+        Raises:
+            MalformedError: it is not what it should be; nothing of it is kept.
+        """
+        if complete:
+            self.incoming.pop((provider, message), None)
+        owner, body, records = evidence_wire.read_evidence(self.kind, payload, self.team)
+        if owner == self.own:
+            raise MalformedError("evidence: a neighbor speaks for this robot")
         if not complete:
-            owner, _, _ = evidence_wire.read_evidence_head(self.kind, payload, self.team)
             if owner not in self.evidence:
                 entry = self.incoming.setdefault((provider, message), Incoming(owner, provider))
                 if entry.owner != owner:
                     raise MalformedError("evidence: chunks of different owners in one message")
                 entry.chunks.append(payload)
             return owner if owner in self.evidence else None
-        self.incoming.pop((provider, message), None)
-        owner, body, records = evidence_wire.read_evidence(self.kind, payload, self.team)
-        if owner == self.own:
-            raise MalformedError("evidence: a neighbor speaks for this robot")
         if owner not in self.evidence:
             self.evidence[owner], self.bodies[owner] = SHELF.put((records, body))
             self.evidence_bytes[owner] = payload
@@ -129,10 +133,7 @@ class Knowledge:
             parts = []
             for key in sorted(k for k, entry in self.incoming.items() if entry.owner == owner):
                 for chunk in self.incoming[key].chunks:
-                    try:
-                        parts.append(evidence_wire.read_evidence(self.kind, chunk, self.team)[2])
-                    except MalformedError:
-                        continue
+                    parts.append(evidence_wire.read_evidence(self.kind, chunk, self.team)[2])
             records = np.concatenate(parts) if parts else np.zeros(0, evidence_wire.record_dtype(self.kind))
         _, first = np.unique(records["id"], return_index=True)
         return records[first]

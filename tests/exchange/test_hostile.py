@@ -16,13 +16,16 @@ from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of, team_of
 from duagc.pipeline.exchange.session_result import result_of
+from duagc.pipeline.exchange.wire import evidence_wire
 from duagc.pipeline.network.packets import (
     HEADER_BYTES,
     Kind,
     MalformedError,
     Packet,
+    chunk_bytes,
     parse,
     payload_bytes,
+    records_per_chunk,
     serialize,
 )
 from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
@@ -184,6 +187,34 @@ def test_forgeries_that_nothing_betrays_crash_and_hang_nobody(team: list[RobotDa
         assert np.isfinite(result.T_world_keyframe).all()
         assert name in result.component
     assert all(agent.round < 10_000 for agent in agents.values())
+
+
+@pytest.mark.parametrize(
+    ("owner", "color", "reason"),
+    [
+        (0, np.nan, "evidence: not a finite number"),
+        (0, 1e30, "evidence: a Gaussian of impossible place or size"),
+        (1, 0.5, "evidence: a neighbor speaks for this robot"),
+        (0, 0.5, None),
+    ],
+)
+def test_a_part_of_evidence_is_refused_as_it_arrives(
+    team: list[RobotData], owner: int, color: float, reason: str | None
+) -> None:
+    """A chunk of a message whose rest never comes."""
+    kind = Kind.EVIDENCE_EXACT
+    bravo = team_of(team, ExchangeConfig(evidence_wire="float32"), seed=0)["bravo"]
+    body = np.zeros(2 * records_per_chunk(kind), evidence_wire.record_dtype(kind))
+    body["id"] = np.arange(len(body))
+    body["theta"][1] = color
+    evidence = evidence_wire.write_evidence(kind, owner, "blended", body)
+    bravo.tick(
+        0, 0, [serialize(Packet(kind, 0, 1, 0, 0, 9, 0, len(evidence), evidence[: chunk_bytes(kind)]))]
+    )
+    taken = reason is None
+    assert bravo.refused == ({} if taken else {reason: 1})
+    assert len(bravo.sharing.knowledge.incoming) == taken
+    assert len(bravo.sharing.knowledge.records(0)) == taken * records_per_chunk(kind)
 
 
 def test_a_signature_holds_for_one_sender_and_one_seed() -> None:
