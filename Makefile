@@ -28,7 +28,7 @@ help:
 	@echo "make demo        set up, then simulate two robots, fuse their maps, evaluate, report ($(DEMO))"
 	@echo "make test        set up, then run the tests, and print their processor time by folder"
 	@echo "make golden      make the stored runs again and name every difference (minutes)"
-	@echo "make lint        ruff and mypy"
+	@echo "make lint        ruff, mypy and codespell"
 	@echo "make docs        the site of the documentation, every link checked (build/site)"
 	@echo "make bench       speed of the kernels, side by side with plain torch"
 	@echo "make check-full  the slow checks as well, and the kernels under sanitizers (minutes)"

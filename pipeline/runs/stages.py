@@ -5,7 +5,8 @@ To add a stage `NAME`:
 1. `schemas/topics.py`: one `Topic` for each new topic, `producer="NAME"`.
 2. Here: `NAME = Stage("NAME", reads=..., writes=..., reads_files=..., writes_files=...)`, and its place in `STAGES`.
 3. `pipeline/NAME/stage.py`: a function from paths to paths; it reads with `read_log` and writes with `LogWriter`.
-4. `pipeline/steps.py`: a function that calls it, named by `code` of the declaration; `pipeline/runner.py`: its place.
+4. `pipeline/steps.py`: a function that calls it, named by `code` of the declaration; `pipeline/chain.py`: a
+   method that runs it; `pipeline/job.py`: its place.
 5. `pipeline/runs/digest.py`: the files that it writes, so that digests cover them.
 6. `tests/layers.py`: the folder, and what it may import.
 
