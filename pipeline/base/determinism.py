@@ -5,7 +5,7 @@ environment. One BLAS thread, because a product split over threads sums in anoth
 OpenBLAS, numpy and OpenCV on every machine, because their AVX-512 paths round differently; and nothing of Intel's IPP
 in OpenCV, which computes angles of SIFT another way on every family of processors. glibc gives the memory of an
 image back to the system as soon as it is freed, and clearing it again for the next one took a third of the time of a
-conversion: it keeps up to 64 MB.
+conversion: it keeps up to 256 MB.
 """
 
 import ctypes

@@ -41,6 +41,7 @@ def depth_agreement(
 
     Args:
         depths_m: [h, w] of every view, 0 = unknown.
+        camera: of the views.
         trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
     Returns:
         Number of pairs, and the value of every trajectory.

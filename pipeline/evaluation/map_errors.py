@@ -45,6 +45,7 @@ def map_errors(gaussian_map: GaussianMap, surface: Surface, T_gt_map: Array) -> 
 
     Args:
         gaussian_map: with information, in its frame.
+        surface: the true one, in the ground-truth world.
         T_gt_map: [4, 4], from that frame into the ground-truth world.
     """
     means_gt = se3.transform(T_gt_map, gaussian_map.gaussians.means.astype(np.float64))

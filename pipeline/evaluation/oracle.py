@@ -76,7 +76,9 @@ def gap_to_oracle(
     """Largest gap over all components of two robots or more.
 
     Args:
-        decisions: every duagc.v1.LoopClosureDecision of the run. pairs: ids of matched Gaussians [n, 2] by robots.
+        run: with the robots' results and settings.
+        decisions: every duagc.v1.LoopClosureDecision of the run.
+        pairs: ids of matched Gaussians [n, 2], by robots.
     Raises:
         DuagError: the settings of the run are not what they should be.
     """
@@ -243,8 +245,10 @@ def solve_component(
     where that robot has it, which is how the robots fix the gauge.
 
     Args:
-        T_world_keyframe: [n, 4, 4] of every member, by its own estimate. odometry: with the floor of `config`.
-        closures: between members, with final weights. config: of the run.
+        T_world_keyframe: [n, 4, 4] of every member, by its own estimate.
+        odometry: of every member, with the floor of `config`.
+        closures: between members, with final weights.
+        config: of the run.
     """
     team = PoseGraph.of_team(T_world_keyframe, odometry, closures, config.closures)
     solution = solve_pose_graph(team.relative_poses, team.T_start, team.weights)

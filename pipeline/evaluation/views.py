@@ -246,6 +246,7 @@ def score_maps(
         maps: by name, with the T_frame_camera [4, 4] of the views in the map's frame, by time stamp in ns; a
             map whose poses lack a view is Absent there.
         camera: of the views.
+        views: what is rendered and compared.
         threads: views at a time, each with a rasterizer of one thread; changes no bit of the result.
         depth: of a Gaussian at a pixel, as the maps were made.
         compared: names of the maps whose common pixels `depth_l1_common_m` is over.

@@ -200,7 +200,7 @@ class Agent:
             self.radio.take_loop_closing(n, arrival.kind, payload)
         elif arrival.kind is Kind.RELATIVE_FRAME:
             if self.poses is not None:
-                raise MalformedError("frame: all of them were known before the poses began")
+                raise MalformedError("relative frame: all of them were known before the poses began")
             self._frames.take(n, payload)
         elif arrival.kind is Kind.TREE:
             self._take_tree(n, payload)

@@ -55,7 +55,7 @@ class MapAlignment:
         pair = (frames.lower, frames.higher)
         if pair not in self.pairs:
             if held(pair):
-                raise MalformedError("frame: a neighbor speaks for this robot")
+                raise MalformedError("relative frame: a neighbor speaks for this robot")
             self._know(pair, frames, payload)
         return pair
 

@@ -166,8 +166,10 @@ class GaussianAgent:
         """Start with own evidence.
 
         Args:
-            theta: [n, 13], common frame; of tracks that are only passed on, anything. weights: zero there.
+            theta: [n, 13], common frame; of tracks that are only passed on, anything.
+            weights: of these values; zero for tracks that are only passed on.
             links: by neighbor, own rows of the tracks that both hold, in an order that both have.
+            config: of the rounds.
         """
         self.config = config
         self._own = weights
@@ -267,7 +269,10 @@ def optimum(theta: Sequence[Array], weights: Sequence[Weights], rows: Sequence[I
     """theta* [tracks, 13] = (sum W)^+ sum W theta over all robots: what one computer with all evidence would say.
 
     Args:
-        theta, weights, rows: by robot, values [n, 13], their weights and the tracks [n] that they belong to.
+        theta: by robot, values [n, 13].
+        weights: by robot, of these values.
+        rows: by robot, the tracks [n] that they belong to.
+        tracks: how many there are.
     """
     total, pull = total_weights(weights, rows, tracks), np.zeros((tracks, COORDINATES))
     for x, w, at in zip(theta, weights, rows, strict=True):

@@ -69,6 +69,8 @@ def run(run_folder: RunFolder, recording: Recording, config: FrontendConfig) -> 
     """Errors of the team's poses, of what its images say from two starts, and what the truth's own poses are worth.
 
     Args:
+        run_folder: of a run whose robots share one world.
+        recording: that the run was made of, with ground truth.
         config: of the run's front ends.
     Returns:
         "rows", one per trajectory: team_ate_rmse_m under one alignment, own_ate_rmse_m, the mean of those under an own

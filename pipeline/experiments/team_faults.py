@@ -172,7 +172,12 @@ def run(
     """Every session of the checks asked for, compared with the undisturbed one.
 
     Args:
-        config, seed: of the run. checks: some of CHECKS. seeds: how often what is drawn is drawn.
+        run_folder: of a finished run.
+        recording: that the run was made of.
+        config: of the run's exchange.
+        seed: of the run.
+        checks: some of CHECKS.
+        seeds: how often what is drawn is drawn.
     Returns:
         "base" and "rows", a row per session; "worst" per case: the largest difference of the team's error (m, share).
     """

@@ -26,9 +26,9 @@ from duagc.pipeline.recording import Motion, MotionPrior
 from duagc.pipeline.registration import Registration
 
 EXTRAPOLATED_INTERVALS = 1.5
+"""Usual intervals between frames over which a velocity predicts in any case."""
 MOST_INTERVALS = 8
 """That a velocity predicts, which was measured over one: images that waited in a driver come in bursts."""
-"""Usual intervals between frames over which a velocity predicts in any case."""
 RECENT_FRAMES = 7  # whose mean velocity moves depth of another time
 
 

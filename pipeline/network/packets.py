@@ -44,7 +44,7 @@ class Kind(IntEnum):
     DESCRIPTORS = 4  # compact descriptors of every keyframe, to recognize places
     REQUEST = 5  # keyframes whose sample is wanted
     SAMPLE = 6  # one keyframe: features with 3-D points, and points for registration
-    CLOSURES = 7  # verdict on the pair: shared keyframes, metric, relative frame
+    CLOSURES = 7  # verdict on the pair: shared keyframes and their metric
     VOXELS = 8  # space that the sender's keyframes saw
     ANCHORS = 9  # agreed poses of the keyframes of one robot
     PAIRS = 10  # matched Gaussians of two robots

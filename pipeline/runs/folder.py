@@ -65,12 +65,12 @@ class RobotRun:
 
     @cached_property
     def odometry(self) -> Trajectory:
-        """T_map_camera of all frames, before consensus, in the robot's own map frame."""
+        """T_map_camera of all frames that are not lost, before consensus, in the robot's own map frame."""
         return self._trajectory("odometry.tum")
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """T_world_camera of all frames, after consensus, by the robot's own estimate."""
+        """T_world_camera of all frames that are not lost, after consensus, by the robot's own estimate."""
         return self._trajectory("trajectory.tum")
 
     @cached_property
@@ -296,14 +296,17 @@ class RunFolder:
 
     @property
     def timing(self) -> dict[str, dict[str, Any]]:
-        """Stage -> {"robot", "wall_s", "cpu_s", "peak_rss_mb"}; empty if the run has no timing.json."""
+        """Label -> {"stage", "robot", "wall_s", "cpu_s", "peak_rss_mb", "executed"}; empty without timing.json.
+
+        What a row of somebody else does not say follows from its label; then the stage counts as executed.
+        """
         stages = self._json("timing.json").get("stages", {})
         rows = stages.values() if isinstance(stages, dict) else [None]
         if not all(isinstance(row, dict) and all(_is_number(row.get(n)) for n in TIMES) for row in rows):
             raise DuagError(
                 f"{self.path / 'timing.json'}: found no table of {', '.join(TIMES)} of every stage, expected one"
             )
-        return stages
+        return {name: _of_label(name) | {"executed": True} | row for name, row in stages.items()}
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -332,6 +335,12 @@ class RunFolder:
                 found = type(content[key]).__name__
                 raise DuagError(f"{path}: {key} is a {found}, expected a {kind.__name__}")
         return content
+
+
+def _of_label(name: str) -> dict[str, str | None]:
+    """Stage and robot of a row of timing.json, as `timing.label` names it."""
+    stage, _, robot = name.partition(".")
+    return {"stage": stage, "robot": robot or None}
 
 
 def _is_number(value: object) -> bool:

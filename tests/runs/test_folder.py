@@ -107,6 +107,17 @@ def read_calibration(run: RunFolder) -> object:
     return run.calibration
 
 
+def test_a_time_of_somebody_else_is_of_the_stage_that_its_label_names(tmp_path: Path) -> None:
+    row = {"wall_s": 2.0, "cpu_s": 3.0, "peak_rss_mb": 100.0}
+    stored = {"stage": "exchange", "robot": None, "executed": False}
+    stages = {"frontend.alpha": row, "exchange": row | stored}
+    (tmp_path / "timing.json").write_text(json.dumps({"stages": stages}))
+    assert RunFolder(tmp_path).timing == {
+        "frontend.alpha": row | {"stage": "frontend", "robot": "alpha", "executed": True},
+        "exchange": row | stored,
+    }
+
+
 @pytest.mark.parametrize(
     ("name", "content", "read", "complaint"),
     [

@@ -89,12 +89,12 @@ def _keyframe_count(reader: Reader) -> int:
 
 
 def write_indices(indices: list[int]) -> bytes:
-    """Bytes of REQUEST: keyframe indices."""
+    """Bytes of REQUEST and RECTIFIED_REQUEST: keyframe indices."""
     return array_bytes(indices, "uint32")
 
 
 def read_indices(data: bytes, limit: int) -> list[int]:
-    """From REQUEST: ascending keyframe indices below `limit`."""
+    """From REQUEST and RECTIFIED_REQUEST: ascending keyframe indices below `limit`."""
     if len(data) % 4:
         raise MalformedError("request: not a list of indices")
     indices = Reader(data, "request").array("uint32", (len(data) // 4,)).tolist()

@@ -257,17 +257,19 @@ def write_relative_frames(frames: RelativeFrames, *, short: bool = False) -> byt
 
 
 def read_relative_frames(data: bytes, team: int) -> RelativeFrames:
-    """From FRAME."""
-    reader = Reader(data, "frame")
+    """From RELATIVE_FRAME."""
+    reader = Reader(data, "relative frame")
     lower, higher, count = reader.fields(_FRAME)
     n, short = count % _SHORT_PROPOSALS, count >= _SHORT_PROPOSALS
     if not lower < higher < team or not 1 <= n <= MAX_PROPOSALS:
-        raise MalformedError("frame: the two robots must be in the team, lower first, and have a frame")
+        raise MalformedError(
+            "relative frame: the two robots must be in the team, lower first, and have a frame"
+        )
     proposals = []
     for _ in range(n):
         support, *variance, agreement = reader.fields(_SHORT_PROPOSAL if short else _PROPOSAL)
         if not (all(0 < v < MAX_COORDINATE**2 for v in variance) and 0 <= agreement <= 1):
-            raise MalformedError("frame: impossible variance or agreement")
+            raise MalformedError("relative frame: impossible variance or agreement")
         T = reader.motions(1, "float32")[0] if short else reader.poses(1)[0]
         proposals.append(Proposal(support, T, (variance[0], variance[1]), agreement))
     reader.done()
