@@ -85,11 +85,3 @@ def descriptor_set(schema: str) -> bytes:
 
     add(message_class(schema).DESCRIPTOR.file)
     return out.SerializeToString(deterministic=True)
-
-
-def own_schemas() -> list[str]:
-    """Full names of all messages of package duagc.v1, sorted."""
-    files = descriptor_pb2.FileDescriptorSet.FromString(
-        (Path(__file__).parent / "descriptors.binpb").read_bytes()
-    )
-    return sorted(f"{PACKAGE}.{m.name}" for f in files.file if f.package == PACKAGE for m in f.message_type)

@@ -68,22 +68,6 @@ class StageKey:
         )
 
 
-def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings as one table of dotted names.
-
-    Args:
-        settings: nested tables.
-        prefix: of every name.
-    """
-    out: dict[str, Any] = {}
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            out |= flat_settings(value, f"{prefix}{name}.")
-        else:
-            out[f"{prefix}{name}"] = value
-    return out
-
-
 def _differences(
     before: Mapping[str, Any], after: Mapping[str, Any], values: bool = True
 ) -> Iterator[tuple[str, str]]:
