@@ -249,21 +249,19 @@ class Agent:
 
     def _states(self, neighbor: Neighbor, state: bytes) -> list[Message]:
         """The state of this round, with the poses of this round if there are any."""
-        payloads = [state]
+        payloads, own, peer = [state], self.graph.robot, neighbor.name
         missing = injection.poses_are_missing(
-            self.config.injection,
-            seed=self.seed,
-            robot=self.graph.robot,
-            peer=neighbor.name,
-            round_index=self.round,
+            self.config.injection, seed=self.seed, robot=own, peer=peer, round_index=self.round
         )
         sends_poses = neighbor.index in self.links and not missing and not self._all_agreed()
         if self.poses is not None and sends_poses:
             parts = self.poses.states(self.links[neighbor.index], MAX_PAYLOAD_BYTES - len(state))
             payloads = [state + part for part in parts] or payloads
         # with evidence to share, states go out in every round
-        if payloads == [state] and not self.sharing.enabled and neighbor.was_sent(state, self.round):
-            return []
+        if payloads == [state] and not self.sharing.enabled:
+            if neighbor.was_sent(state, self.round):
+                return []
+            neighbor.note_sent(state, self.round)
         return [Message(self.radio.new_id(), Kind.STATE, payload) for payload in payloads]
 
     def _all_agreed(self) -> bool:

@@ -87,7 +87,7 @@ class Neighbor:
     voxels: NDArray[np.int64] | None = None
 
     def was_sent(self, state: bytes, round_index: int) -> bool:
-        """Whether it was sent this very state lately; if not, it is now.
+        """Whether it was sent this very state lately.
 
         Args:
             state: the bytes of the own state.
@@ -95,10 +95,16 @@ class Neighbor:
         """
         known, sent_round = self.sent_state
         due = round_index - sent_round >= self.transport.repeat_after_rounds
-        if self.transport.last_heard is not None and state == known and not due:
-            return True
+        return self.transport.last_heard is not None and state == known and not due
+
+    def note_sent(self, state: bytes, round_index: int) -> None:
+        """Remember that it is sent a state.
+
+        Args:
+            state: the bytes of the own state.
+            round_index: the current round.
+        """
         self.sent_state = state, round_index
-        return False
 
     @property
     def decided(self) -> bool:

@@ -8,8 +8,8 @@ from duagc.pipeline.frontend.nearby_registration import register_predicted
 from duagc.pipeline.frontend.tracking_state import TrackingState
 
 
-def missing_image(state: TrackingState, frame: CurrentFrame) -> Reason:
-    """Which image of a frame cannot be used; counts such frames in a row.
+def count_missing_image(state: TrackingState, frame: CurrentFrame) -> Reason:
+    """Find which image of a frame cannot be used, and count such frames in a row.
 
     Args:
         state: what the tracker knows; the counts are updated.

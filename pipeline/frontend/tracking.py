@@ -23,7 +23,7 @@ from duagc.pipeline.frontend.failure import Reason, saturated_share
 from duagc.pipeline.frontend.frame_images import Image, RgbdImages
 from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
 from duagc.pipeline.frontend.keyframe_insertion import insert_first_keyframe, insert_keyframe
-from duagc.pipeline.frontend.missing_images import follow_by_color, follow_by_depth, missing_image
+from duagc.pipeline.frontend.missing_images import count_missing_image, follow_by_color, follow_by_depth
 from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
@@ -166,7 +166,7 @@ class Tracker:
         state = self.state
         state.intervals.update(frame.stamp_ns)
         state.lost = state.lost or state.is_after_gap(frame.stamp_ns)
-        missing = missing_image(state, frame)
+        missing = count_missing_image(state, frame)
         if missing is Reason.NONE and not state.keyframes:
             return self._initialize(frame)
         found = self._locate(frame, missing)

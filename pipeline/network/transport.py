@@ -303,8 +303,11 @@ class Transport:
         Raises:
             MalformedError: it contradicts what came before, or asks for too much; it is then ignored.
         """
-        if not self._is_new(packet.sequence):
+        block, bit = packet.sequence // SEQUENCE_BLOCK, 1 << packet.sequence % SEQUENCE_BLOCK
+        heard = self._heard.get(block, 0)
+        if heard & bit:
             return None  # a copy that the network made, or a replayed packet
+        self._heard[block] = heard | bit  # however far sequence numbers jump
         self.last_heard = round_index
         self._packets_heard += 1
         size = self._overhead_bytes + len(packet.payload)
@@ -316,13 +319,6 @@ class Transport:
         if packet.kind is Kind.STATE:
             return Arrival(packet.kind, packet.message, packet.payload, complete=True)
         return self._take_chunk(packet, round_index)
-
-    def _is_new(self, sequence: int) -> bool:
-        """Whether a sequence number is heard for the first time; remembers it, however far it jumps."""
-        block, bit = sequence // SEQUENCE_BLOCK, 1 << sequence % SEQUENCE_BLOCK
-        heard = self._heard.get(block, 0)
-        self._heard[block] = heard | bit
-        return not heard & bit
 
     def _take_chunk(self, packet: Packet, round_index: int) -> Arrival | None:
         known = self._received.get(packet.message)
