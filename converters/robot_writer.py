@@ -30,7 +30,6 @@ from duagc.pipeline.recording import (
 )
 from duagc.schemas import topics
 
-NANOSECONDS = 1_000_000_000
 FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
 
 

@@ -34,7 +34,7 @@ from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import Source, piece_before, pieces_words, sources_of, unread
 from duagc.converters.logs.unmeasured import first_depths, float_unit_m
-from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
+from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
@@ -44,6 +44,7 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.greatest_depth import SATURATED, unmeasured
 from duagc.pipeline.recording.register_depth import register_depth
 

@@ -39,7 +39,7 @@ from duagc.converters.logs import open_log
 from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.gather import gathered, nearest
-from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
+from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
@@ -47,6 +47,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import encode_png, read_text
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.messages.parts import NANOSECONDS
 
 LEFT, RIGHT = "left_camera/compressed", "right_camera/compressed"
 POINTS, IMU = "velodyne_points", "imu/data"

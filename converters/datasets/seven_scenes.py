@@ -23,7 +23,7 @@ from duagc.converters.layouts.calibrated import correct, is_pinhole, numbers, sq
 from duagc.converters.layouts.image_files import kept_color, options_of, read_depth, rigid
 from duagc.converters.layouts.image_folder import LengthOptions
 from duagc.converters.layouts.self_check import ReprojectionCheck
-from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
+from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
@@ -35,6 +35,7 @@ from duagc.pipeline.geometry import depth_error, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.kernels.drawn_depth import displaced_depth
+from duagc.pipeline.messages.parts import NANOSECONDS
 
 Depth = Array
 Reference = dict[int, Array]  # T_world_color [4, 4] by frame number

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from duagc.converters.layouts.image_files import kept_color, read_color, read_depth
 from duagc.converters.layouts.self_check import ReprojectionCheck
-from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
+from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
@@ -31,6 +31,7 @@ from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import Lens, Maps, rectified, seen_by_source
 from duagc.pipeline.geometry.masks import Mask
+from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.greatest_depth import unmeasured
 
 Item = TypeVar("Item")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.motion import MotionPrior
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
@@ -26,7 +27,6 @@ _TIMES = {  # fields of times, and seconds per unit if their name says it
 }
 _UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 FARTHEST_M, LONGEST_S = 1e4, 10.0  # no point is farther away, no sweep longer
-NANOSECONDS = 1_000_000_000
 MOMENT_NS = 2_000_000  # points no further apart in time are moved together
 LEAST_PERIOD_S, USUAL_PERIOD_S, MOST_PERIOD_S = 1e-3, 0.1, 0.2  # between sweeps, unless some were left out
 LEAST_SHARE, MOST_SHARE = 0.02, 20.0  # of the period, that a sweep takes: one unit is between them

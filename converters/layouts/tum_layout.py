@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from duagc.converters.layouts.image_folder import FrameFiles, LengthOptions
-from duagc.converters.robot_writer import NANOSECONDS
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.pairing import TOLERANCE_KEY, TOLERANCE_NS
 
 LAST_NS = 1 << 62  # about the year 2116

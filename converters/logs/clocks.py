@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.logs.choice import IMAGE_TYPES, INFO_TYPE, POINTS_TYPE
-from duagc.converters.logs.entries import NANOSECONDS, stamp_ns
+from duagc.converters.logs.entries import stamp_ns
 from duagc.converters.logs.files import Log, is_below
 from duagc.converters.logs.frames import TF_TYPES
 from duagc.converters.logs.motion import IMU_TYPE
@@ -32,6 +32,7 @@ from duagc.converters.logs.video import is_video
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import so3
+from duagc.pipeline.messages.parts import NANOSECONDS
 
 MOST_SHARED = 5000  # messages of a log that are compared
 LEAST_SHARED = 5

@@ -22,7 +22,6 @@ from duagc.converters.layouts.ros_images import check_decodes, color_bytes
 from duagc.converters.layouts.ros_points import PointTimes
 from duagc.converters.layouts.stereo import RawCamera, StereoRig
 from duagc.converters.logs.cameras import realsense_extrinsics
-from duagc.converters.logs.entries import NANOSECONDS
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import Transforms, body_axes_of_camera
 from duagc.converters.logs.motion import extrinsics_of
@@ -35,7 +34,6 @@ from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.motion import MotionPrior
 
-MOST_APART_S = 0.001  # of the images of a stereo pair
 TIMED_SWEEPS = 8  # by which it is found how points say their times
 
 
@@ -257,19 +255,3 @@ def some_pairs(pairs: dict[int, int]) -> list[tuple[int, int]]:
     """Up to `ROW_PAIRS` pairs of times, evenly spread."""
     stamps = sorted(pairs)
     return [(stamps[k], pairs[stamps[k]]) for k in sorted(spread(len(stamps), ROW_PAIRS))]
-
-
-def eyes_apart(stamps_ns: Sequence[tuple[int, int]], topics: tuple[str, str]) -> list[str]:
-    """A warning if the images of a stereo pair are not of one time; else none.
-
-    Args:
-        stamps_ns: times of both images of every pair.
-        topics: of the left and of the right eye.
-    """
-    apart_s = float(np.median([abs(left - right) for left, right in stamps_ns])) / NANOSECONDS
-    if apart_s <= MOST_APART_S:
-        return []
-    return [
-        f"{topics[0]} and {topics[1]} are {1e3 * apart_s:.1f} ms apart (median), expected a stereo pair of one time: "
-        "if the camera moved in between, all depth is wrong"
-    ]

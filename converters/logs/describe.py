@@ -15,14 +15,16 @@ import numpy as np
 
 from duagc.converters.logs.choice import IMAGE_TYPES, POINTS_TYPE, Chooser, repeats
 from duagc.converters.logs.clocks import RobotClock, compare, overlap_warnings
-from duagc.converters.logs.entries import NANOSECONDS, Entry
+from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import SUFFIXES, Log, is_own_log, open_log
 from duagc.converters.logs.motion import IMU_TYPE, POSE_TYPES
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import Source, is_log, pieces_words, robot_of, sources_of, unread
 from duagc.converters.logs.video import is_video
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import size_bytes
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.names import MAGIC, RECORDING_FILE
 
 HEADERS_FIRST, HEADERS_EACH = (
@@ -137,7 +139,7 @@ def _log(log: Log) -> dict[str, Any]:
         seen.append(entry.log_ns)
     spans = [(t[0], t[-1]) for t in times.values() if t]
     return {
-        "bytes": sum(_size(part.path) for part in log.parts),
+        "bytes": sum(size_bytes(part.path) for part in log.parts),
         "pieces": [part.path.name for part in log.parts],
         "start_ns": min((a for a, _ in spans), default=None),
         "end_ns": max((b for _, b in spans), default=None),
@@ -179,11 +181,6 @@ def _rate(times: array[int]) -> float | None:
 
 def _median_s(delays: list[int]) -> float | None:
     return float(np.median(delays)) / NANOSECONDS if delays else None
-
-
-def _size(path: Path) -> int:
-    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
-    return sum(p.stat().st_size for p in files)
 
 
 def _robot(log: Log, source: Source) -> tuple[RobotLog | None, dict[str, Any]]:

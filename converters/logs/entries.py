@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.messages.parts import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 LAST_NS = 1 << 62
 
 

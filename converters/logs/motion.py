@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.tum_layout import Poses
-from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
+from duagc.converters.logs.entries import Entry, sound_time
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import (
     TF_TYPES,
@@ -25,6 +25,7 @@ from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.motion import GyroPrior, MotionPrior, OdometryPrior
 
 POSE_TYPES = (

@@ -12,7 +12,7 @@ import numpy as np
 
 from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.layouts.ros_images import is_integer_depth, size_of
-from duagc.converters.layouts.tum_layout import Listed, associate, nearest_s
+from duagc.converters.layouts.tum_layout import Listed, associate
 from duagc.converters.logs.cameras import (
     CameraWatch,
     as_stated,
@@ -23,32 +23,24 @@ from duagc.converters.logs.cameras import (
 )
 from duagc.converters.logs.choice import Chooser
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
-from duagc.converters.logs.derived import (
-    Derived,
-    Picture,
-    Stereo,
-    eyes_apart,
-    some_pairs,
-    stereo_of,
-    sweeps_of,
-)
-from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
+from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
+from duagc.converters.logs.entries import Entry, sound_time
 from duagc.converters.logs.files import Log, is_own_log
 from duagc.converters.logs.frames import TF_TYPES, Transforms, frame_name
 from duagc.converters.logs.gather import gathered
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.registration import ImageTopic, check_infos, check_samples, extrinsics
-from duagc.converters.logs.stamps import clock_words, sound_stamps
+from duagc.converters.logs.stamps import clock_words, eyes_apart, no_pairs, sound_stamps
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.lens import Lens, Maps
 from duagc.pipeline.geometry.masks import Mask
+from duagc.pipeline.messages.parts import NANOSECONDS
 
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
-LONGEST_WAIT_S = 60.0  # between color and depth of one clock
 OUT_SCALE = 0.0005  # meters per unit of depth that was registered or came as floats
 
 
@@ -343,15 +335,7 @@ class RobotLog:
             settings = settings.model_copy(update={"association": "official"})
         found = associate(listed[self.color], listed[self.depth], settings)
         if not found:
-            away = nearest_s(*([image.stamp_ns for image in listed[t]] for t in (self.depth, self.color)))
-            other_clock = away > LONGEST_WAIT_S and settings.time_source == "header"
-            remedy = "time_source=log" if other_clock else "max_difference_s=SECONDS"
-            if not other_clock and settings.keeps_depth_time:
-                remedy = f"association=nearest --set {remedy}"
-            raise DuagError(
-                f"{self.name}: no image on {self.depth} within {settings.limit_ns / NANOSECONDS:g} s of one on "
-                f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set {remedy}"
-            )
+            raise no_pairs(self.name, (self.color, self.depth), listed, settings)
         pairs: dict[int, int | None] = {c.stamp_ns: d.stamp_ns for c, d in found}
         alone = [c.stamp_ns for c in listed[self.color] if c.stamp_ns not in pairs]
         kept = settings.keeps_depth_time

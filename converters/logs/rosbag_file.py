@@ -13,9 +13,10 @@ from urllib.parse import quote
 from duagc.converters.logs import foxglove
 from duagc.converters.logs.bag_messages import messages
 from duagc.converters.logs.definitions import of_ros2
-from duagc.converters.logs.entries import NANOSECONDS, Entry, LogTopic, sound_time, stamp_ns
+from duagc.converters.logs.entries import Entry, LogTopic, sound_time, stamp_ns
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, read_text
+from duagc.pipeline.messages.parts import NANOSECONDS
 
 _READ = {
     "builtin_interfaces": "Time",

@@ -18,13 +18,13 @@ from typing import Any
 
 from duagc.converters.layouts.image_files import options_of
 from duagc.converters.logs.choice import IMAGE_TYPES
-from duagc.converters.logs.entries import NANOSECONDS
 from duagc.converters.logs.files import SUFFIXES, is_own_log, open_log
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.writer import robot_names
 from duagc.pipeline.base.atomic_folder import RECORDING, RUN
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import check_file, read_toml
+from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.schemas import topics
 
 NAMESPACE = "{namespace}"  # stands for that of each robot in the names of topics

@@ -6,12 +6,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from duagc.converters.logs.entries import NANOSECONDS
+from duagc.converters.layouts.tum_layout import Listed, nearest_s
+from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.messages.parts import NANOSECONDS
 
 MOST_STEPS_BACK = (
     5.0  # intervals of frames that transport may exchange; a clock that was set back goes further
 )
+LONGEST_WAIT_S = 60.0  # between color and depth of one clock
+MOST_APART_S = 0.001  # of the images of a stereo pair
 LONGEST_DELAY_S = 1.0  # between topics: what drivers compute before they publish takes less
 
 
@@ -65,3 +69,42 @@ def _check_steps_back(where: str, times: Sequence[int]) -> None:
             f"{where}: times go back by {back[worst] / NANOSECONDS:.3f} s to {known[worst] / NANOSECONDS:.3f} s, as "
             "of a clock that was set back; expected times in the order of recording, or --set time_source=log"
         )
+
+
+def no_pairs(
+    name: str, topics: tuple[str, str], listed: Mapping[str, Sequence[Listed]], options: LogOptions
+) -> DuagError:
+    """The error of a log none of whose depth images is near one of color.
+
+    Args:
+        name: of the log.
+        topics: of color and of depth.
+        listed: images by topic.
+        options: of the association.
+    """
+    color, depth = topics
+    away_s = nearest_s(*([image.stamp_ns for image in listed[topic]] for topic in (depth, color)))
+    other_clock = away_s > LONGEST_WAIT_S and options.time_source == "header"
+    remedy = "time_source=log" if other_clock else "max_difference_s=SECONDS"
+    if not other_clock and options.keeps_depth_time:
+        remedy = f"association=nearest --set {remedy}"
+    return DuagError(
+        f"{name}: no image on {depth} within {options.limit_ns / NANOSECONDS:g} s of one on {color} (the nearest is "
+        f"{away_s:.3f} s away), expected pairs, or --set {remedy}"
+    )
+
+
+def eyes_apart(stamps_ns: Sequence[tuple[int, int]], topics: tuple[str, str]) -> list[str]:
+    """A warning if the images of a stereo pair are not of one time; else none.
+
+    Args:
+        stamps_ns: times of both images of every pair.
+        topics: of the left and of the right eye.
+    """
+    apart_s = float(np.median([abs(left - right) for left, right in stamps_ns])) / NANOSECONDS
+    if apart_s <= MOST_APART_S:
+        return []
+    return [
+        f"{topics[0]} and {topics[1]} are {1e3 * apart_s:.1f} ms apart (median), expected a stereo pair of one time: "
+        "if the camera moved in between, all depth is wrong"
+    ]

@@ -91,6 +91,29 @@ def digest_of_values(values: Any) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
+def digest_of_bytes(path: Path) -> str:
+    """64 hex characters of SHA-256 over the bytes of a file.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def size_bytes(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder and below.
+
+    Args:
+        path: of the file or folder.
+    """
+    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+    return sum(p.stat().st_size for p in files)
+
+
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """A name next to `path` to write to: it becomes `path` when the block ends well, else it is removed.

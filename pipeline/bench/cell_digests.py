@@ -9,6 +9,7 @@ from pathlib import Path
 
 from duagc.converters.simulate.render import mesh_process, meshes
 from duagc.converters.simulate.scenes.catalog import SCENES
+from duagc.pipeline.base.files import digest_of_bytes
 from duagc.pipeline.base.library_versions import PYTHON, library_version
 
 LIBRARIES = (
@@ -55,9 +56,7 @@ def mesh_digest(scene: str) -> dict[str, str]:
         return {}
     digest = hashlib.sha256()
     for path in _files(folder, (*meshes.UP_OF_SUFFIX, *mesh_process.OTHERS)):
-        with path.open("rb") as stream:
-            content = hashlib.file_digest(stream, "sha256").hexdigest()
-        digest.update(f"{path.relative_to(folder).as_posix()}\0{content}\n".encode())
+        digest.update(f"{path.relative_to(folder).as_posix()}\0{digest_of_bytes(path)}\n".encode())
     return {"meshes": digest.hexdigest()}
 
 

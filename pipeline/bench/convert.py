@@ -22,6 +22,7 @@ from duagc.converters.logs.files import open_log
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import sources_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import size_bytes
 from duagc.pipeline.base.workers import peak_memory_bytes
 from duagc.pipeline.recording.write import mcap_writer
 
@@ -47,11 +48,11 @@ def run(src: Path, options: Sequence[str], folder: Path) -> dict[str, Any]:
         folder.mkdir(parents=True)
     except OSError as error:
         raise DuagError(f"{folder}: {error.strerror or error}, expected to write there") from error
-    out: dict[str, Any] = {"log": src.name, "bytes": _size(src), "topics": topics}
+    out: dict[str, Any] = {"log": src.name, "bytes": size_bytes(src), "topics": topics}
     try:
         for task in TASKS:
             target = folder / task
-            out[task] = {**_measured(task, src, target, topics, options=options), "bytes": _size(target)}
+            out[task] = {**_measured(task, src, target, topics, options=options), "bytes": size_bytes(target)}
             _remove(target)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -81,11 +82,6 @@ def _measured(
     if done.returncode:
         raise DuagError(f"{src}: the process that was to {task} it ended with {done.returncode}")
     return {**json.loads(done.stdout.splitlines()[-1]), "wall_s": time.monotonic() - start}
-
-
-def _size(path: Path) -> int:
-    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
-    return sum(p.stat().st_size for p in files)
 
 
 def _remove(path: Path) -> None:

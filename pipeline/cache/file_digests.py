@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from duagc.pipeline.base.files import digest_of_bytes
 from duagc.pipeline.cache.publish import publish
 
 _TICK_NS, _COARSE_TICK_NS = 20_000_000, 2_000_000_000
@@ -57,7 +58,7 @@ class FileDigests:
         if state is not None and (found := self._stored(path, state)) is not None:
             return found
         content = digest_file(path)
-        raw = raw_digest(path) if path.suffix == ".mcap" else content
+        raw = digest_of_bytes(path) if path.suffix == ".mcap" else content
         found = FileDigest(content, raw, path.stat().st_size)
         if state is not None and state == _state(path):
             self._keep(path, state, found)
@@ -72,7 +73,7 @@ class FileDigests:
         path = Path(os.path.abspath(path))
         state = _state(path)
         known = None if state is None else self._stored(path, state)
-        return raw_digest(path) if known is None else known.raw
+        return digest_of_bytes(path) if known is None else known.raw
 
     def keep(self, path: Path, digest: FileDigest) -> None:
         """Remember the digests of a file that was just written from known bytes.
@@ -110,16 +111,6 @@ class FileDigests:
             tick_ns = _TICK_NS if changed_ns % 1_000_000_000 else _COARSE_TICK_NS
             if file.stat().st_mtime_ns - changed_ns < tick_ns:  # the clock of the disk gave both times
                 file.unlink()
-
-
-def raw_digest(path: Path) -> str:
-    """SHA-256 of the bytes of a file.
-
-    Args:
-        path: of the file.
-    """
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _state(path: Path) -> list[int] | None:

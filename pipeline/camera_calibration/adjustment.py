@@ -18,8 +18,8 @@ from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
 from duagc.pipeline.camera_calibration.views import Views, look_up, normals_at
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
-from duagc.pipeline.registration.residuals import depth_noise
 
 ROUNDS = 30
 CONVERGED, CONVERGED_OF_PRIOR = (
@@ -33,7 +33,7 @@ PRIOR = dict(zip(NAMES, (15, 15, 15, 15, 0.3, 0.5, 0.5, 0.01, 0.01, 0.01, 0.02, 
 NEIGHBORS, MIN_OVERLAP = 4, 0.3  # views that the depth of a view is compared with
 GATE_M, GATE_RELATIVE = 0.08, 0.05
 FEATURE_GATE_M = 0.15
-NOISE = depth_noise(RegistrationConfig())
+NOISE = DepthNoise.stated(RegistrationConfig())
 
 
 @dataclass(frozen=True)

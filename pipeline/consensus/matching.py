@@ -30,12 +30,12 @@ from duagc.pipeline.consensus.colors import ColorMap, team_colors
 from duagc.pipeline.consensus.evidence import Evidence, PlacedGaussians
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY
+from duagc.pipeline.splat.ply import SH_DEGREE_0
 
 Index = NDArray[np.int64]
 Rows = NDArray[np.int32] | NDArray[np.int64]
 Pairs = Mapping[tuple[str, str], Index]
 Placed = Evidence | PlacedGaussians
-SH_C0 = 0.28209479177387814  # color = 0.5 + SH_C0 * coefficient
 _FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
 
 
@@ -133,7 +133,7 @@ class _Compared:
         out = np.empty(len(self.i))
         for part in row_blocks(len(self.i)):
             i, j = self.i[part], self.j[part]
-            color = (a.theta[i, COLOR] - b.theta[j, COLOR]) / SH_C0
+            color = (a.theta[i, COLOR] - b.theta[j, COLOR]) / SH_DEGREE_0
             opacity = a.theta[i, OPACITY] - b.theta[j, OPACITY]
             squared = self.apart[part] + config.beta_color * np.sum(color**2, axis=1)
             out[part] = np.sqrt(squared + config.beta_opacity * opacity**2)

@@ -20,6 +20,7 @@ from duagc.pipeline.base.component_names import robot_of, same_robot
 from duagc.pipeline.evaluation.feature_agreement import FEATURES, MatchedPair, match_views
 from duagc.pipeline.evaluation.network import is_inlier
 from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.registration.features import Features, extract
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
@@ -110,6 +111,6 @@ def _log_ratio(pair: MatchedPair) -> float:
 def _median(log_ratios: list[float]) -> DepthScale:
     values = np.array(log_ratios)
     median = float(np.median(values))
-    sigma = 1.4826 * float(np.median(np.abs(values - median))) / np.sqrt(len(values))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(values - median))) / np.sqrt(len(values))
     ratio = float(np.exp(median))
     return DepthScale(ratio, ratio * max(FLOOR, float(sigma)), len(values))

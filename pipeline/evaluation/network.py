@@ -26,6 +26,7 @@ from duagc.pipeline.evaluation.oracle import (
     used_matches,
 )
 from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.exchange.record import RUNNING_KINDS
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.recording import Record, read_log
 from duagc.pipeline.runs.folder import RunFolder
@@ -61,8 +62,6 @@ PURPOSE = {  # of a message, by its kind
     "TREE": "poses",
     "ACK": "acknowledgements",
 }
-RUNNING_KINDS = ("STATE", *(k for k, use in PURPOSE.items() if use in ("Gaussians", "acknowledgements")))
-"""Kinds whose bytes are not set-up; messages of a solver are."""
 PURPOSES = ("Gaussians", "poses", "set-up", "acknowledgements")
 PAPER_BYTES_PER_PAIR = 2 * 28 * 4  # 28 float32 from each of the two robots
 NO_EXCHANGE = Absent("the robots exchanged nothing")
@@ -106,7 +105,7 @@ class Packets:
     @property
     def setup_bytes(self) -> int:
         """All but states of rounds, evidence and acknowledgements."""
-        return int(self.size_bytes[~np.isin(self.kind, RUNNING_KINDS)].sum())
+        return int(self.size_bytes[~np.isin(self.kind, sorted(RUNNING_KINDS))].sum())
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.evaluation import uncertainty_calibration
 from duagc.pipeline.evaluation.pixel_deviation import (
     RenderedDepth,
@@ -80,7 +79,7 @@ def scores_of_robot(run: RunFolder, source: Recording, name: str, *, threads: in
         threads: views rendered at the same time; changes no bit of the result.
     """
     robot, settings = run.robots[name], run.config.information
-    noise, stated = stated_noise(settings), {"own": stated_own(robot)}
+    noise, stated = DepthNoise.stated(settings), {"own": stated_own(robot)}
     if robot.refined_map is not None:
         stated["refined"] = stated_in_world(robot, robot.refined_map)
     found: dict[tuple[str, str], list[PixelErrors]] = {(kind, s): [] for kind in stated for s in SETS}
@@ -159,11 +158,6 @@ class _Views:
         error_m = np.abs(z[both].astype(np.float64) - true[both])
         predicted_m = np.hypot(sigma_m[both].astype(np.float64), sensor_m[sample][both])
         return PixelErrors(error_m, predicted_m, int(np.count_nonzero(compared & ~both)))
-
-
-def stated_noise(settings: InformationConfig) -> DepthNoise:
-    """The noise of the depth sensor by the settings alone: no residual of a map is in it."""
-    return DepthNoise(settings.depth_sigma_base_m, settings.depth_sigma_quadratic_per_m)
 
 
 def true_depth(view: ScoredFrame, noise: DepthNoise) -> tuple[NDArray[np.float32], Array]:

@@ -153,7 +153,7 @@ class ExchangeRecorder:
 
 
 RUNNING_KINDS = frozenset(kind.name for kind in (Kind.ACK, Kind.STATE, *EVIDENCE_KINDS))
-"""Kinds whose bytes are not set-up."""
+"""Names of kinds whose bytes are not set-up; messages of a solver are."""
 
 
 @dataclass(frozen=True)

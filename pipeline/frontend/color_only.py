@@ -14,6 +14,7 @@ import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FailureConfig
+from duagc.pipeline.frontend.keyframe_graph import OPEN_DIRECTION
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import (
     Outcome,
@@ -24,8 +25,6 @@ from duagc.pipeline.registration import (
     register,
 )
 from duagc.pipeline.registration.align import reach_factor
-
-OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m is no knowledge
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.registration.definition import GRAY_OF_RGB
+from duagc.pipeline.registration.definition import GRAY_WEIGHTS
 
 BLOCK_PX = 16
 LEAST_KNOWN = 0.75  # share of the pixels of a block
@@ -41,7 +41,7 @@ class CorrelatedBlocks:
         known = where.astype(np.float64)
         count = _sums(known)
         a, b = (
-            _without_plane((image @ GRAY_OF_RGB).astype(np.float64), known, count) for image in (seen, shown)
+            _without_plane((image @ GRAY_WEIGHTS).astype(np.float64), known, count) for image in (seen, shown)
         )
         n = np.maximum(count, 1.0)
         variance_a, variance_b, covariance = _sums(a * a) / n, _sums(b * b) / n, _sums(a * b) / n

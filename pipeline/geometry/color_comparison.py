@@ -15,6 +15,7 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.statistics import mad_sigmas
 
+GRAY_OF_RGB = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601 luma
 ROUNDS = 20
 """Of reweighting."""
 _TUNING = 3.0  # standard deviations at which a pair counts a quarter

@@ -71,7 +71,7 @@ def estimate_noise(views: MapViews, config: InformationConfig, *, every: int = 4
         every: of the blocks, in both directions.
     """
     camera, rasterizer = views.camera, views.rasterizer()
-    model = DepthNoise(config.depth_sigma_base_m, config.depth_sigma_quadratic_per_m)
+    model = DepthNoise.stated(config)
     unit = ImageNoise(1.0, model)
     colors, depths = [np.zeros(0)], [np.zeros(0)]
     sample = np.ix_(_in_blocks(camera.height, every), _in_blocks(camera.width, every))

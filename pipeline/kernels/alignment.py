@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import _raster
+from duagc.pipeline.kernels.arguments import floats_of
 from duagc.pipeline.kernels.outputs import NOTHING
 
 Floats = NDArray[np.float32]
@@ -131,23 +132,17 @@ def level_arrays(
     """
     n, shape = len(points), (camera.height, camera.width)
     arrays = (
-        _checked("points", points, (n, 3)),
-        _checked("normals", normals, (n, 3)),
-        _checked("intensities", intensities, (n,)),
-        NOTHING if depth_sigmas is None else _checked("depth_sigmas", depth_sigmas, (n,)),
-        _checked("gray", gray, shape),
-        _checked("inverse_depth", inverse_depth, shape),
-        NOTHING if depth_sigma_m is None else _checked("depth_sigma_m", depth_sigma_m, shape),
-        NOTHING if target_normals is None else _checked("target_normals", target_normals, (*shape, 3)),
+        floats_of("points", points, (n, 3)),
+        floats_of("normals", normals, (n, 3)),
+        floats_of("intensities", intensities, (n,)),
+        NOTHING if depth_sigmas is None else floats_of("depth_sigmas", depth_sigmas, (n,)),
+        floats_of("gray", gray, shape),
+        floats_of("inverse_depth", inverse_depth, shape),
+        NOTHING if depth_sigma_m is None else floats_of("depth_sigma_m", depth_sigma_m, shape),
+        NOTHING if target_normals is None else floats_of("target_normals", target_normals, (*shape, 3)),
     )
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
     return _raster.LevelArrays(*arrays, intrinsics, has_depth)
-
-
-def _checked(name: str, array: Floats, shape: tuple[int, ...]) -> Floats:
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
-    return np.ascontiguousarray(array, dtype=np.float32)
 
 
 def align_at(

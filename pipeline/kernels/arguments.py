@@ -10,7 +10,7 @@ import operator
 import reprlib
 from enum import IntEnum
 from numbers import Real
-from typing import SupportsIndex, TypeVar
+from typing import Any, SupportsIndex, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -232,6 +232,19 @@ def checked_bytes(name: str, image: object, shape: tuple[int, ...]) -> NDArray[n
         shape: expected, that of the camera.
     """
     return _checked_array(name, image, np.uint8, shape, meaning="the size of the camera")
+
+
+def floats_of(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Numbers of any type as a contiguous array of float32.
+
+    Args:
+        name: of the argument, for the message.
+        array: as it was given.
+        shape: expected.
+    """
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    return np.ascontiguousarray(array, dtype=np.float32)
 
 
 def _checked_array(

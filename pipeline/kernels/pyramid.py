@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import _raster
+from duagc.pipeline.kernels.arguments import floats_of
 from duagc.pipeline.kernels.outputs import NOTHING
 
 Image = NDArray[np.float32]
@@ -53,7 +54,7 @@ def inverse_depth_of(
     """
     depths = np.ascontiguousarray(depth_m, dtype=np.float32)
     inverse = _empty(*depths.shape)
-    sigma = NOTHING if sigma_m is None else _like("sigma_m", sigma_m, depths.shape)
+    sigma = NOTHING if sigma_m is None else floats_of("sigma_m", sigma_m, depths.shape)
     known = NOTHING if sigma_m is None else _empty(*depths.shape)
     _raster.invert_depth(isa, depths, _bytes(mask, depths.shape), sigma, inverse, known)
     return inverse, None if sigma_m is None else known
@@ -78,9 +79,9 @@ def halved(
     """
     shape = gray.shape[0] // 2, gray.shape[1] // 2
     half_gray, half_depth = _empty(*shape), _empty(*shape)
-    sigma = NOTHING if sigma_m is None else _like("sigma_m", sigma_m, gray.shape)
+    sigma = NOTHING if sigma_m is None else floats_of("sigma_m", sigma_m, gray.shape)
     half_sigma = NOTHING if sigma_m is None else _empty(*shape)
-    images = _like("gray", gray, gray.shape), _like("inverse_depth", inverse_depth, gray.shape)
+    images = floats_of("gray", gray, gray.shape), floats_of("inverse_depth", inverse_depth, gray.shape)
     out = half_gray, half_depth, half_sigma
     _raster.halve(isa, *images, sigma, _bytes(half_mask, shape), *out)
     return half_gray, half_depth, None if sigma_m is None else half_sigma
@@ -111,15 +112,9 @@ def surface_normals(
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
     grid = (np.ascontiguousarray(chosen, dtype=np.int32) for chosen in (rows, columns))
     _raster.surface_normals(
-        isa, _like("inverse_depth", inverse_depth, inverse_depth.shape), *grid, intrinsics, normals
+        isa, floats_of("inverse_depth", inverse_depth, inverse_depth.shape), *grid, intrinsics, normals
     )
     return normals
-
-
-def _like(name: str, image: NDArray[Any], shape: tuple[int, ...]) -> Image:
-    if image.shape != shape:
-        raise ValueError(f"{name} has shape {image.shape}, expected {shape}")
-    return np.ascontiguousarray(image, dtype=np.float32)
 
 
 def _bytes(mask: Mask | None, shape: tuple[int, ...]) -> NDArray[np.uint8]:

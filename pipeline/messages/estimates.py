@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc import schemas
+from duagc.pipeline.base.arrays import array_bytes
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.messages.maps import GaussianInformation, GaussianMap, MapUpdate
 from duagc.pipeline.messages.parts import (
@@ -17,7 +18,6 @@ from duagc.pipeline.messages.parts import (
     Array,
     map_frame,
     numbers,
-    pack_array,
     pack_information,
     pack_pose,
     pack_stamp,
@@ -327,8 +327,8 @@ class CorrectedKeyframes:
             robot=self.robot,
             component=list(self.component),
             count=len(poses),
-            keyframe_indices_int32=pack_array(self.keyframe_indices, "int32"),
-            poses_world_keyframe_float64=pack_array(poses[:, :3], "float64"),
+            keyframe_indices_int32=array_bytes(self.keyframe_indices, "int32"),
+            poses_world_keyframe_float64=array_bytes(poses[:, :3], "float64"),
         )
         pack_stamp(message, self.stamp_ns)
         return message

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc import schemas
+from duagc.pipeline.base.arrays import array_bytes
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.messages.parts import (
     map_frame,
-    pack_array,
     pack_stamp,
     unpack_array,
     unpack_stamp,
@@ -83,7 +83,7 @@ def _pack_gaussians(gaussians: Gaussians, m: Any) -> None:
     """Set a duagc.v1.GaussianArrays, array by array: those of a long log take hundreds of megabytes."""
     m.count = len(gaussians)
     for name, field, dtype, _ in _GAUSSIAN_FIELDS:
-        setattr(m, field, pack_array(getattr(gaussians, name), dtype))
+        setattr(m, field, array_bytes(getattr(gaussians, name), dtype))
 
 
 def unpack_gaussians(m: Any) -> Gaussians:
@@ -166,7 +166,7 @@ class GaussianInformation:
             ("observations_uint32", self.observations, "uint32"),
             ("deviation_m_float32", self.deviation_m, "float32"),
         ):
-            setattr(m, field, pack_array(array, dtype))
+            setattr(m, field, array_bytes(array, dtype))
         m.color_sigma, m.depth_sigma = float(self.color_sigma), self.depth_sigma
         m.color_pixels_per_sample = float(self.color_pixels_per_sample)
         m.depth_pixels_per_sample = float(self.depth_pixels_per_sample)

@@ -36,11 +36,6 @@ def unpack_stamp(message: Any) -> int:
     return message.timestamp.seconds * NANOSECONDS + message.timestamp.nanos
 
 
-def pack_array(array: ArrayLike, dtype: str) -> bytes:
-    """Little-endian bytes in C order; `dtype` as numpy names it, for example "float32"."""
-    return np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
-
-
 def unpack_array(data: bytes, dtype: str, shape: tuple[int, ...], field: str) -> NDArray[Any]:
     """Array of a shape from little-endian bytes; a writable copy.
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc import schemas
-from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.messages.parts import numbers, pack_array, pack_stamp, unpack_array, unpack_stamp
+from duagc.pipeline.base.arrays import Array, array_bytes
+from duagc.pipeline.messages.parts import numbers, pack_stamp, unpack_array, unpack_stamp
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class RejectedMatches:
             lower=self.lower,
             higher=self.higher,
             count=len(self.ids),
-            ids_int64=pack_array(self.ids, "int64"),
+            ids_int64=array_bytes(self.ids, "int64"),
         )
         pack_stamp(message, self.stamp_ns)
         return message

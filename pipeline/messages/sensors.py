@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc import schemas
-from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.arrays import Array, array_bytes
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, encode_png
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import FISHEYE_NUMBERS, POLYNOMIAL_NUMBERS, Lens
-from duagc.pipeline.messages.parts import camera_frame, numbers, pack_array, pack_stamp, unpack_array
+from duagc.pipeline.messages.parts import camera_frame, numbers, pack_stamp, unpack_array
 
 PLUMB_BOB, RATIONAL, FISHEYE = "plumb_bob", "rational_polynomial", "kannala_brandt"  # as Foxglove calls them
 
@@ -35,7 +35,7 @@ def pack_depth(stamp_ns: int, robot: str, depth: NDArray[np.uint16]) -> Any:
     if depth.dtype != np.uint16 or depth.ndim != 2:
         raise ValueError(f"depth is {depth.dtype} {depth.shape}, expected uint16 [H, W]")
     height, width = depth.shape
-    data = pack_array(depth, "uint16")
+    data = array_bytes(depth, "uint16")
     fields = {"width": width, "height": height, "encoding": "16UC1", "step": 2 * width, "data": data}
     return _foxglove("RawImage", stamp_ns, camera_frame(robot), **fields)
 
@@ -218,7 +218,7 @@ _NUMBER_TYPES = {7: "float32", 8: "float64"}  # foxglove.PackedElementField.Nume
 def pack_points(stamp_ns: int, frame_id: str, points_m: ArrayLike) -> Any:
     """foxglove.PointCloud of points [n, 3], float32 meters."""
     fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
-    data = pack_array(points_m, "float32")
+    data = array_bytes(points_m, "float32")
     pose = {"orientation": {"w": 1.0}}
     return _foxglove("PointCloud", stamp_ns, frame_id, pose=pose, point_stride=12, fields=fields, data=data)
 

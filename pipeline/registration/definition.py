@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.color_comparison import GRAY_OF_RGB
 
 Image = NDArray[Any]
 
-GRAY_OF_RGB = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601 luma
+GRAY_WEIGHTS = GRAY_OF_RGB.astype(np.float32)
 SAME_SURFACE = np.float32(0.05)  # relative difference of depth up to which neighbors count as one surface
 NORMAL_WINDOWS = (5, 3)  # pixels; the smaller one is used where the larger touches an edge or a hole
 
@@ -28,7 +29,7 @@ def gray_of_color(color: Image) -> Image:
     """
     if color.dtype == np.uint8:
         color = color.astype(np.float32) * np.float32(1 / 255)
-    red, green, blue = (GRAY_OF_RGB[k] * color[..., k] for k in range(3))
+    red, green, blue = (GRAY_WEIGHTS[k] * color[..., k] for k in range(3))
     return red + green + blue
 
 

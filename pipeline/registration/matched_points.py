@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.geometry.statistics import huber_divisor, median
 from duagc.pipeline.registration.normal_equations import regular
-from duagc.pipeline.registration.residuals import depth_noise
 
 REFINEMENT_ROUNDS = 3  # of fitting to the inliers and finding them again
 WEIGHTED_STEPS = 6  # of Gauss-Newton, each with new weights
 HUBER_SIGMAS = 2.4  # of distances in three dimensions, two of three of which are below 1.9
-DEPTH_NOISE = depth_noise(RegistrationConfig())  # of structured light; its scale is estimated
+DEPTH_NOISE = DepthNoise.stated(RegistrationConfig())  # of structured light; its scale is estimated
 LEAST_ANGLE_RAD, LARGEST_ANGLE_RAD = 5e-4, 1e-2  # of a feature: a quarter of a pixel, and some pixels
 LEAST_FACTOR, LARGEST_FACTOR = 0.1, 10.0  # on the noise of depth: exact depth, and poor stereo
 MEDIAN_OF_SQUARES = 0.455  # of a standard normal number

@@ -174,7 +174,7 @@ def linearize_at(
     surface[0] = ((u - camera.cx) / camera.fx).astype(np.float32) * z
     surface[1] = ((v - camera.cy) / camera.fy).astype(np.float32) * z
     surface[2] = z
-    sigma = measured_sigma[0][agreeing] if measured_sigma else depth_noise(config).sigma_m(z)
+    sigma = measured_sigma[0][agreeing] if measured_sigma else DepthNoise.stated(config).sigma_m(z)
     if measured_sigma and samples.depth_sigmas is not None:
         # of two views alike it stays the same, as that of the model
         sigma = np.sqrt(np.float32(0.5) * (sigma**2 + samples.depth_sigmas[seen[agreeing]] ** 2))
@@ -256,15 +256,6 @@ def _normals_agree(
     return cosine > np.float32(np.cos(limit_rad))
 
 
-def depth_noise(config: RegistrationConfig) -> DepthNoise:
-    """The noise of depth that a registration assumes, up to the scale that it estimates.
-
-    Args:
-        config: of the registration.
-    """
-    return DepthNoise(config.depth_sigma_base_m, config.depth_sigma_quadratic_per_m)
-
-
 def _depth_residuals(
     surface: Floats,
     q: Floats,
@@ -291,7 +282,9 @@ def _displacement(
     The scale of the depth residuals holds the noise of both views, so half of its square is the sample's.
     """
     z = samples.points[index, 2]
-    sigma = depth_noise(config).sigma_m(z) if samples.depth_sigmas is None else samples.depth_sigmas[index]
+    sigma = (
+        DepthNoise.stated(config).sigma_m(z) if samples.depth_sigmas is None else samples.depth_sigmas[index]
+    )
     return -t[:, None] * (np.float32(scale * np.sqrt(0.5)) * sigma / z)
 
 

@@ -15,7 +15,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.evaluation.groundtruth import exact_depths, recorded_depth_is_exact
 from duagc.pipeline.evaluation.pixel_deviation import StatedMap, rendered_depth, stated_in_world
-from duagc.pipeline.evaluation.pixel_errors import stated_noise, true_depth
+from duagc.pipeline.evaluation.pixel_errors import true_depth
 from duagc.pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.views import ComparedImage, ScoredFrame, in_exposure, score_view, surface_depth
@@ -94,7 +94,7 @@ def _views_of(run: RunFolder, source: Recording, name: str, number: int) -> tupl
                 log,
                 _compared(frames, source, name),
                 kind=kind,
-                noise=stated_noise(run.config.information),
+                noise=DepthNoise.stated(run.config.information),
                 rasterizer=rasterizer,
             )
             deviations.append(head | predicted)

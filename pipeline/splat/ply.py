@@ -17,7 +17,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file, read_bytes
 from duagc.pipeline.splat.gaussians import Gaussians
 
-SH_DEGREE_0 = 0.28209479177387814
+SH_DEGREE_0 = 0.28209479177387814  # color = 0.5 + SH_DEGREE_0 * coefficient
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),

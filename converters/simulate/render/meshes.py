@@ -6,7 +6,6 @@ color texture of a part, or from the colors of its vertices; lamps, gloss and tr
 sides of a triangle look the same.
 """
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from duagc.converters.layouts.mesh_reader import LEVELS, NO_TEXTURE, texture_fil
 from duagc.converters.simulate.render import mesh_process
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import check_file
+from duagc.pipeline.base.files import check_file, digest_of_bytes
 
 UP_OF_SUFFIX = {".glb": "y", ".gltf": "y", ".obj": "y", ".ply": "z"}  # glTF says so, the others by custom
 UPS = ("auto", "y", "z")
@@ -146,14 +145,9 @@ def _suffixes() -> str:
 def digests(files: list[Path]) -> dict[str, str]:
     """SHA-256 of every file by its name."""
     try:
-        return {path.name: _digest(path) for path in files}
+        return {path.name: digest_of_bytes(path) for path in files}
     except OSError as error:
         raise DuagError(f"{error.filename}: {error.strerror or error}, expected a mesh") from error
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def check_up(up: str) -> None:

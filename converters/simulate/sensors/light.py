@@ -11,9 +11,9 @@ from duagc.converters.simulate.sensors.rig import GAMMA
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.color_comparison import GRAY_OF_RGB
 
 DRIFT_PERIODS_S = (2.5, 7.0)
-GRAY_OF_RGB = np.array([0.299, 0.587, 0.114])
 
 
 def metered(color: NDArray[np.uint8]) -> float:

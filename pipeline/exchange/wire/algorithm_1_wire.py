@@ -10,8 +10,8 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader, array_bytes
+from duagc.pipeline.base.arrays import Array, array_bytes
+from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
 from duagc.pipeline.network.packets import MalformedError
 
 _COUNT = struct.Struct("<I")

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.exchange.wire.state_wire import Reader, array_bytes, pose_bytes
+from duagc.pipeline.base.arrays import Array, array_bytes
+from duagc.pipeline.exchange.wire.state_wire import Reader, pose_bytes
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
 

@@ -8,10 +8,10 @@ from enum import IntEnum
 
 import numpy as np
 
-from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.arrays import Array, array_bytes
 from duagc.pipeline.consensus.elimination import BackSubstitution, Block, Variable
 from duagc.pipeline.consensus.tree import Message, TreeNode
-from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM, Reader, array_bytes
+from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM, Reader
 from duagc.pipeline.network.packets import MalformedError
 
 

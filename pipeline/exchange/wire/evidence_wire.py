@@ -13,7 +13,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.row_blocks import in_blocks
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.exchange.wire.compact_wire import COMPACT, decode, encode
-from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
+from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, MAX_INFORMATION, Reader
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.network.packets import (
     EVIDENCE_BYTES,
@@ -39,7 +39,6 @@ from duagc.pipeline.splat.information import (
     pack_symmetric,
 )
 
-MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
 INDEFINITE_TOLERANCE = 1e-4  # of the largest eigenvalue: rounding of float32
 SENT_TOLERANCE = 0.5 * INDEFINITE_TOLERANCE  # of what is sent, which may be rounded to float32
 MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.exchange.wire.state_wire import MAX_KEYFRAMES, Reader, array_bytes, pose_bytes
+from duagc.pipeline.base.arrays import Array, array_bytes
+from duagc.pipeline.exchange.wire.state_wire import MAX_INFORMATION, MAX_KEYFRAMES, Reader, pose_bytes
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 
-MAX_INFORMATION = 1e15
 _COUNTS = struct.Struct("<II")
 _CLOSURE = struct.Struct("<IIB")
 

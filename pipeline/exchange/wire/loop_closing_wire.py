@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.arrays import Array, array_bytes
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.exchange.wire.camera_wire import camera_bytes, read_camera
 from duagc.pipeline.exchange.wire.state_wire import (
     MAX_KEYFRAMES,
     Reader,
-    array_bytes,
     motion_bytes,
     pose_bytes,
 )

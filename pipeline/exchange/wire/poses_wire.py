@@ -8,8 +8,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import array_bytes
 from duagc.pipeline.consensus.admm_edge import STEP_M, PosePacket
-from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader, array_bytes
+from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
 from duagc.pipeline.network.packets import MalformedError
 
 _POSES = struct.Struct("<IIBHH2f")

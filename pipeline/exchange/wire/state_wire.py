@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.arrays import Array, array_bytes
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.cycle_consistency import Proposal
 
 MAX_KEYFRAMES = 100_000
 MAX_COORDINATE = 1e6  # m, or units of theta; beyond it positions lose their meaning
+MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
 ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbor sent
 
 
@@ -78,11 +79,6 @@ class Reader:
         part = self.data[self.position : self.position + size]
         self.position += size
         return part
-
-
-def array_bytes(values: Any, dtype: str) -> bytes:
-    """Little-endian bytes in C order."""
-    return np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
 
 
 def pose_bytes(T: Array) -> bytes:
