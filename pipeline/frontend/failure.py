@@ -39,6 +39,7 @@ class Reason(Enum):
     NO_PIXEL = "no_pixel"
     FROZEN_DEPTH = "frozen_depth"
     FROZEN_COLOR = "frozen_color"
+    REPEATED = "repeated"
     OBSTRUCTED = "obstructed"
     CONTRADICTION = "contradiction"
     UNCONFIRMED = "unconfirmed"

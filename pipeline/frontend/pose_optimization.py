@@ -22,6 +22,7 @@ from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pos
 from duagc.pipeline.frontend.loop_outliers import consistent_loops
 from duagc.pipeline.frontend.lost_frames import found_afterwards
 from duagc.pipeline.frontend.rejected_parts import RejectedPart
+from duagc.pipeline.frontend.repeated_frames import without_stuck
 from duagc.pipeline.frontend.submaps import lost
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -91,7 +92,7 @@ class PathOptimization:
             checkpoints=self.checkpoints,
             part=f"{self.part}.lost",
         )
-        return replace(path, frames=found)
+        return replace(path, frames=without_stuck(found, T_map_keyframes))
 
     def _consistent_path(
         self,

@@ -40,6 +40,7 @@ class TrackedFrame:
         rms_depth_m: weighted depth residual.
         rms_gray: weighted gray residual.
         reason: why it is lost, or why only its color or only its depth was used.
+        repeats: both images are those of the frame before.
     """
 
     frame_index: int
@@ -52,6 +53,7 @@ class TrackedFrame:
     rms_depth_m: float
     rms_gray: float
     reason: Reason = Reason.NONE
+    repeats: bool = False
 
     @staticmethod
     def by(

@@ -170,7 +170,8 @@ class Tracker:
         if missing is Reason.NONE and not state.keyframes:
             return self._initialize(frame)
         found = self._locate(frame, missing)
-        return self._mark_lost(frame, found) if isinstance(found, Reason) else self._accept(frame, found)
+        tracked = self._mark_lost(frame, found) if isinstance(found, Reason) else self._accept(frame, found)
+        return replace(tracked, repeats=True) if state.frozen.repeats else tracked
 
     def _locate(self, frame: CurrentFrame, missing: Reason) -> PoseCandidate | Reason:
         """Where a frame is, or why that is not known.

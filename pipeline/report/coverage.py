@@ -31,6 +31,7 @@ REASONS = {
     "no_pixel": "the frame shows nothing",
     "frozen_depth": "the depth image is frozen",
     "frozen_color": "the color image is frozen",
+    "repeated": "both images are those before, and the camera had moved",
     "obstructed": "something is in front of the camera, or it is elsewhere",
     "contradiction": "depth and color contradict each other",
     "unconfirmed": "not recognized, or not yet confirmed",
