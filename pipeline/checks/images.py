@@ -18,15 +18,12 @@ from duagc.pipeline.frontend.failure import saturated_share_of
 from duagc.pipeline.kernels.pyramid import gray_of_color
 from duagc.pipeline.messages import unpack_stamp
 from duagc.pipeline.recording import Record, RgbdFrame
+from duagc.pipeline.recording.copies import copies
 from duagc.pipeline.recording.greatest_depth import SATURATED, greatest_apart
 from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics as topic_table
 
 FEW_FRAMES = 0.1  # of a recording: so many with saturated or far depth are enough to be reported
-SAME_IMAGES, SAME_SHARE = (
-    2,
-    0.05,
-)  # more color images in common, and a larger share of the fewer: one recording twice
 BINS = 8  # of a color histogram, per channel
 TAKE_FOR_NONE = "let the converter take it for none; `convert ros`: --set farthest_m=METERS"
 
@@ -117,20 +114,15 @@ def check_copies(colors: Mapping[str, Repeats]) -> Iterator[Finding]:
     Args:
         colors: color images by robot.
     """
-    for a, b in combinations(sorted(colors), 2):
-        same, fewer = (
-            len(colors[a].digests & colors[b].digests),
-            min(len(c.digests) for c in (colors[a], colors[b])),
+    for robot, other, same in copies({name: repeats.digests for name, repeats in colors.items()}):
+        yield Finding(
+            Severity.ERROR,
+            "copies",
+            other,
+            f"{same} of its color images are those of {robot}, byte for byte",
+            "a recording of its own",
+            "what one camera saw once would count twice",
         )
-        if same > max(SAME_IMAGES, SAME_SHARE * fewer):
-            yield Finding(
-                Severity.ERROR,
-                "copies",
-                b,
-                f"{same} of its color images are those of {a}, byte for byte",
-                "a recording of its own",
-                "what one camera saw once would count twice",
-            )
 
 
 @dataclass(frozen=True)
