@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from duagc.converters.layouts.found_regions import FoundRegions
 from duagc.converters.layouts.sigma_units import SIGMA_SCALE_M, sigma_units
 from duagc.converters.layouts.sound_camera import check_camera
+from duagc.converters.layouts.sound_frame import check_color, check_pose, check_sigma, check_stamp
 from duagc.converters.layouts.validity import mask_of_user
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
@@ -29,8 +30,6 @@ from duagc.pipeline.recording import (
     LogWriter,
 )
 from duagc.schemas import topics
-
-FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
 
 
 class RobotWriter:
@@ -166,11 +165,25 @@ class RobotWriter:
                 pixel: then with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
             depth_stamp_ns: time of the depth, one that no other depth has; None: that of the color.
         Raises:
-            ValueError: an image has another size than the camera, or the time does not increase.
-            DuagError: the true pose is beyond FAR_M.
+            ValueError: an image is none or has another size than the camera, the time is no whole number or does not
+                increase, or a standard deviation is negative or not finite.
+            DuagError: the true pose is no rigid motion, or 1e9 m away.
         """
-        self._check_frame(stamp_ns, color_format, (depth, mask, true_mask, depth_sigma_m))
-        name = self.name
+        for image in (depth, mask, true_mask, depth_sigma_m):
+            if image is not None:
+                self._check_size(image)
+        name, where = self.name, f"robot {self.name}: frame at {stamp_ns} ns"
+        for time_ns in (stamp_ns, stamp_ns if depth_stamp_ns is None else depth_stamp_ns):
+            check_stamp(time_ns, where)
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            raise ValueError(f"frame at {stamp_ns} ns comes after one at {self._stamps[-1]} ns")
+        source = self.camera if self._lens is None else self._lens.source
+        check_color(color, color_format, (source.width, source.height), where)
+        if depth is not None and depth_sigma_m is not None:
+            check_sigma(depth_sigma_m, depth, where)
+        if T_world_camera is not None:
+            T_world_camera = np.asarray(T_world_camera)
+            check_pose(T_world_camera, f"robot {self.name}: the true pose at {stamp_ns} ns")
         if not self._stamps:
             calibration = messages.pack_calibration(stamp_ns, name, self.camera, self._lens)
             self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
@@ -190,18 +203,9 @@ class RobotWriter:
             truth_topic = topics.GROUNDTRUTH_MASK.of(name)
             self._truth_log().write(truth_topic, messages.pack_mask(stamp_ns, name, true_mask), stamp_ns)
         if T_world_camera is not None:
-            self._add_true_pose(stamp_ns, np.asarray(T_world_camera))
+            self._add_true_pose(stamp_ns, T_world_camera)
         if exact_depth is not None:
             self._add_exact_depth(stamp_ns, exact_depth)
-
-    def _check_frame(self, stamp_ns: int, color_format: str, images: tuple[NDArray[Any] | None, ...]) -> None:
-        for image in images:
-            if image is not None:
-                self._check_size(image)
-        if color_format not in ("jpeg", "png"):
-            raise ValueError(f"color format {color_format!r}, expected 'jpeg' or 'png'")
-        if self._stamps and stamp_ns <= self._stamps[-1]:
-            raise ValueError(f"frame at {stamp_ns} ns comes after one at {self._stamps[-1]} ns")
 
     def _add_registered_depth(
         self,
@@ -220,12 +224,6 @@ class RobotWriter:
             self._add_sigma(stamp_ns, taken_ns, depth, sigma_m)
 
     def _add_true_pose(self, stamp_ns: int, T_world_camera: NDArray[np.float64]) -> None:
-        far_m = float(np.abs(T_world_camera[:3, 3]).max())
-        if not far_m < FAR_M:
-            raise DuagError(
-                f"robot {self.name}: the true pose at {stamp_ns} ns is {far_m:.3g} m away, "
-                f"expected less than {FAR_M:.0e} m"
-            )
         pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
         self._truth_log().write(topics.GROUNDTRUTH_POSE.of(self.name), pose, stamp_ns)
         self._positions.append(T_world_camera.astype(np.float64)[:3, 3].copy())

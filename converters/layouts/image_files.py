@@ -117,6 +117,8 @@ def rigid(T: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     Raises:
         DuagError: `where` holds something that is no rigid motion.
     """
+    if T.shape != (4, 4):
+        raise DuagError(f"{where}: is a matrix {T.shape}, expected (4, 4)")
     if not np.all(np.isfinite(T)):
         raise DuagError(f"{where}: found numbers that are not finite, expected a pose")
     R = so3.project(T[:3, :3])

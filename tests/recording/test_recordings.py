@@ -101,9 +101,63 @@ def test_bugs_of_converters_are_errors(tmp_path: Path) -> None:
         robot.add_frame(5, png(image(0)), "png", depth(0))
         for stamp, kind, array in ((5, "png", depth(0)), (6, "bmp", depth(0)), (6, "png", depth(0).T)):
             with pytest.raises(ValueError, match=r"expected|comes after"):
-                robot.add_frame(stamp, b"", kind, array)
+                robot.add_frame(stamp, png(image(1)), kind, array)
     with pytest.raises(DuagError, match="robot 'A b'"):
         RobotWriter(tmp_path, "A b", CAMERA, 0.001)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        ({"color": b"xx"}, "color is 2 bytes that are no png, expected an image"),
+        ({"color": b""}, "color is 0 bytes that are no png, expected an image"),
+        ({"color": png(image(1))[:500]}, "color is 500 bytes that are no png"),
+        ({"color": png(image(1)[:6, :8])}, f"color is 8x6, expected {CAMERA.width}x{CAMERA.height}"),
+        ({"color_format": "jpeg"}, "bytes that are no jpeg"),
+        ({"stamp_ns": 6.5}, r"time 6\.5, expected a whole number of nanoseconds"),
+        ({"depth_stamp_ns": 6.5}, r"time 6\.5, expected a whole number of nanoseconds"),
+        (
+            {"depth_sigma_m": np.full(depth(1).shape, -1.0)},
+            "standard deviation of depth is -1 m, expected 0 or",
+        ),
+        ({"depth_sigma_m": np.full(depth(1).shape, np.nan)}, "standard deviation of depth is nan m"),
+        ({"depth_sigma_m": np.full(depth(1).shape, np.inf)}, "standard deviation of depth is inf m"),
+    ],
+)
+def test_a_frame_that_is_none_is_refused(tmp_path: Path, wrong: dict[str, Any], complaint: str) -> None:
+    frame = {"stamp_ns": 6, "color": png(image(1)), "color_format": "png", "depth": depth(1)}
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        robot.add_frame(5, png(image(0)), "png", depth(0))
+        with pytest.raises(ValueError, match=complaint):
+            robot.add_frame(**frame | wrong)
+        robot.add_frame(**frame)
+    with open_rgbd(Recording(tmp_path / "rec").log("alpha")) as log:
+        assert len(log) == 2
+
+
+def test_standard_deviations_where_there_is_no_depth_may_be_no_numbers(tmp_path: Path) -> None:
+    sigma_m = np.where(depth(0) > 0, 0.01, np.nan)
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        robot.add_frame(5, png(image(0)), "png", depth(0), depth_sigma_m=sigma_m)
+
+
+@pytest.mark.parametrize(
+    ("T", "complaint"),
+    [
+        (np.zeros((4, 4)), "rotation is off by 1, expected a rigid motion"),
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "rotation is off by 1, expected a rigid motion"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "rotation is off by 2, expected a rigid motion"),
+        (np.array([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), "expected a rigid motion"),
+        (np.eye(4)[:3], r"is a matrix \(3, 4\), expected \(4, 4\)"),
+        (np.full((4, 4), np.nan), "numbers that are not finite, expected a pose"),
+        (se3.from_rotation_translation(np.eye(3), np.array([1e10, 0, 0])), r"is 1e\+10 m away"),
+    ],
+)
+def test_a_true_pose_that_is_no_pose_is_refused(tmp_path: Path, T: np.ndarray, complaint: str) -> None:
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        with pytest.raises(DuagError, match=f"^robot alpha: the true pose at 5 ns.*{complaint}"):
+            robot.add_frame(5, png(image(0)), "png", depth(0), T_world_camera=T)
+        robot.add_frame(5, png(image(0)), "png", depth(0), T_world_camera=np.eye(4))
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,7 @@ def test_sensors_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         robot.set_depth_camera(PinholeCamera(4, 3, 5, 5, 1, 1), np.eye(4), 0.001)
         with pytest.raises(ValueError, match="an image is"):
             robot.add_depth(0, np.zeros((4, 4), np.uint16))
-        robot.add_frame(7, b"", "png", np.zeros((180, 240), np.uint16))
+        robot.add_frame(7, picture(np.zeros((180, 240, 3), np.uint8)), "png", np.zeros((180, 240), np.uint16))
 
 
 def test_readings_may_come_after_the_last_frame_of_a_robot_that_sees_itself(tmp_path: Path) -> None:
