@@ -83,8 +83,8 @@ def _class_of(schema: str, schema_data: bytes) -> Any:
 
 
 @contextmanager
-def parsing(path: Path) -> Iterator[None]:
-    """Turn whatever a reader stumbles over in a broken file into one line."""
+def parsing(path: Path, stream: IO[bytes] | None = None) -> Iterator[None]:
+    """Turn whatever a reader stumbles over in a broken file, or in one that was closed, into one line."""
     try:
         yield
     except (DuagError, GeneratorExit):
@@ -92,6 +92,8 @@ def parsing(path: Path) -> Iterator[None]:
     except OSError as error:
         raise DuagError(f"{path}: {error.strerror or error}, expected an MCAP log") from error
     except Exception as error:
+        if stream is not None and stream.closed:
+            raise DuagError(f"{path}: the log was closed, expected it open while it is read") from error
         raise DuagError(
             f"{path}: found {type(error).__name__} ({error}), expected a sound MCAP log"
         ) from error
@@ -228,7 +230,7 @@ class LogFile:
         """All messages of some topics, or of all, in the order of the log."""
         for topic in self.channels if topics is None else topics:
             check_read(self.path, topic)
-        with parsing(self.path):
+        with parsing(self.path, self._stream):
             for schema, channel, m in self._reader.iter_messages(topics=topics, log_time_order=True):
                 name, data = (schema.name, schema.data) if schema else ("", b"")
                 times = self._sound_time(m.log_time), self._sound_time(m.publish_time)
@@ -244,12 +246,12 @@ class LogFile:
 
     def metadata(self) -> list[tuple[str, dict[str, str]]]:
         """Metadata records: name and text."""
-        with parsing(self.path):
+        with parsing(self.path, self._stream):
             return [(m.name, m.metadata) for m in self._reader.iter_metadata()]
 
     def attachments(self) -> list[bytes]:
         """Attachments, each as one string of bytes with its name and times."""
-        with parsing(self.path):
+        with parsing(self.path, self._stream):
             return [
                 framed(
                     a.name.encode(),
@@ -267,7 +269,7 @@ class LogFile:
             return []
         number = self.channels[topic].id
         out = []
-        with parsing(self.path):
+        with parsing(self.path, self._stream):
             for chunk in self.summary.chunk_indexes:
                 position = chunk.message_index_offsets.get(number)
                 if position is None:
@@ -297,7 +299,7 @@ class LogFile:
         return _publish_times[(*file, topic)]
 
     def _publish_time(self, entry: tuple[int, int, int]) -> int:
-        with parsing(self.path):
+        with parsing(self.path, self._stream):
             return self._sound_time(int(_MESSAGE.unpack_from(self._chunk(entry[1]), entry[2])[-1]))
 
     def _sound_time(self, time_ns: int) -> int:
@@ -309,7 +311,7 @@ class LogFile:
         """The message at an entry of `entries(topic)`; the last few chunks are kept unpacked."""
         check_read(self.path, topic)
         _, start, offset = entry
-        with parsing(self.path):
+        with parsing(self.path, self._stream):
             data = self._chunk(start)
             _, length, number, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, offset)
             channel = self.channels[topic]
@@ -337,13 +339,13 @@ class LogFile:
         return self._chunks[start]
 
 
-def read_log(path: Path, topics: Iterable[str | Topic] | None = None) -> Iterator[Record]:
+def read_log(path: Path, topics: str | Topic | Iterable[str | Topic] | None = None) -> Iterator[Record]:
     """Yield the messages of a log, ordered by log time and then by position in the file.
 
     Args:
         path: an MCAP file; its checksums are compared before the first message comes.
-        topics: only these; all if None. A row of the topic table stands for that topic of every robot in the log.
-            A topic that the log does not have yields nothing.
+        topics: only these, or this one; all if None. A row of the topic table stands for that topic of every robot in
+            the log. A topic that the log does not have yields nothing.
 
     Raises:
         DuagError: the log is damaged, or the stage that runs did not declare a topic that it reads.
@@ -352,7 +354,7 @@ def read_log(path: Path, topics: Iterable[str | Topic] | None = None) -> Iterato
         if topics is None:
             yield from log.records(None)
             return
-        wanted = set(topics)
+        wanted = {topics} if isinstance(topics, str | Topic) else set(topics)
         names = {t for t in wanted if isinstance(t, str)}
         names |= {t for t in log.channels if (row := find_topic(t)) is not None and row[0] in wanted}
         yield from log.records(sorted(names))
@@ -360,7 +362,7 @@ def read_log(path: Path, topics: Iterable[str | Topic] | None = None) -> Iterato
 
 def merge(paths: Sequence[Path], topics: Iterable[str] | None = None) -> Iterator[Record]:
     """Yield the messages of several logs, ordered by log time, then by place in `paths`, then as in their log."""
-    wanted = None if topics is None else sorted(topics)
+    wanted = topics if topics is None or isinstance(topics, str) else sorted(topics)
 
     def keyed(number: int, path: Path) -> Iterator[tuple[int, int, int, Record]]:
         for index, record in enumerate(read_log(path, wanted)):

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.recording import LogWriter, content_digest, log_metadata, merge, read_log
+from duagc.pipeline.recording import LogWriter, content_digest, log_metadata, merge, open_rgbd, read_log
 from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics
 from tests.fixtures.recording_logs import update, write_camera, write_updates
@@ -38,6 +38,24 @@ def test_sequences_count_per_topic(tmp_path: Path) -> None:
     for topic in (topics.COLOR.of("alpha"), topics.DEPTH.of("alpha")):
         assert [r.sequence for r in read_log(path, [topic])] == [0, 1, 2, 3]
     assert list(read_log(path, ["/alpha/odometry"])) == []
+
+
+def test_one_topic_may_stand_alone(tmp_path: Path) -> None:
+    path = write_camera(tmp_path / "alpha.mcap")
+    color = topics.COLOR.of("alpha")
+    for one in (color, topics.COLOR):
+        assert [r.topic for r in read_log(path, one)] == [color] * 4
+    assert [r.topic for r in merge([path], color)] == [color] * 4
+    assert list(read_log(path, "/alpha/odometry")) == []
+
+
+def test_a_log_that_was_closed_says_so(tmp_path: Path) -> None:
+    path = write_camera(tmp_path / "alpha.mcap")
+    log = open_rgbd(path)
+    log.close()
+    with pytest.raises(DuagError) as raised:
+        log.frame(3)
+    assert str(raised.value) == f"{path}: the log was closed, expected it open while it is read"
 
 
 def test_many_chunks_come_back_in_order(tmp_path: Path) -> None:
