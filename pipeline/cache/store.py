@@ -79,7 +79,7 @@ def default_store(out: Path) -> Path:
         out: folder of the run.
     """
     named = os.environ.get(ENVIRONMENT)
-    return Path(named) if named else Path(os.path.abspath(out)).parent / FOLDER
+    return Path(os.path.expanduser(named)) if named else Path(os.path.abspath(out)).parent / FOLDER
 
 
 class Store:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from duagc.pipeline.cli.common import ConfigFile, Json, Overrides, bench_app
+from duagc.pipeline.cli.common import ConfigFile, Json, Overrides, bench_app, of_home
 
 
 @bench_app.command("raster")
@@ -285,7 +285,8 @@ def bench_paths(
     if max(teams) > MAX_ROBOTS:
         raise typer.BadParameter(f"{max(teams)} is more than {MAX_ROBOTS}", param_hint="--robots")
     asked = numbers("--overlap", overlap, 0, 1)
-    rows = paths.run(scenes.split(","), paradigms.split(","), teams, asked, frames=frames, seed=seed, up=up)
+    places = [of_home(scene) for scene in scenes.split(",")]
+    rows = paths.run(places, paradigms.split(","), teams, asked, frames=frames, seed=seed, up=up)
     print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
 
 

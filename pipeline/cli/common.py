@@ -1,25 +1,55 @@
 """What the commands share: the application, options, how they speak. Light at import."""
 
+import os
 import sys
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from duagc import __version__
 
 EXIT_FAILED, EXIT_DIFFERENT = 1, 3
+Command = TypeVar("Command", bound=Callable[..., Any])
 
-app = typer.Typer(
+
+def of_home(path: str) -> str:
+    """A path whose `~` is the home of the user; the shell leaves it in `--out=~/room` and in quotes."""
+    return os.path.expanduser(path)
+
+
+class Commands(typer.Typer):
+    """Commands that get their paths with the home of the user in the place of `~`."""
+
+    def command(self, *args: Any, **named: Any) -> Callable[[Command], Command]:
+        """Like `typer.Typer.command`."""
+        register = super().command(*args, **named)
+
+        def registered(command: Command) -> Command:
+            @wraps(command)
+            def called(**values: Any) -> Any:
+                return command(
+                    **{n: Path(of_home(str(v))) if isinstance(v, Path) else v for n, v in values.items()}
+                )
+
+            register(called)
+            return command
+
+        return registered
+
+
+app = Commands(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-config_app = typer.Typer(no_args_is_help=True, help="Settings of a run and their documentation.")
-bench_app = typer.Typer(no_args_is_help=True, help="Speed, side by side with something else in the same run.")
-golden_app = typer.Typer(
+config_app = Commands(no_args_is_help=True, help="Settings of a run and their documentation.")
+bench_app = Commands(no_args_is_help=True, help="Speed, side by side with something else in the same run.")
+golden_app = Commands(
     no_args_is_help=True, help="A few bytes that stand for a run, to compare later ones with."
 )
 app.add_typer(config_app, name="config")

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.cli.common import EXIT_DIFFERENT, StoreFolder, app, say
+from duagc.pipeline.cli.common import EXIT_DIFFERENT, Commands, StoreFolder, app, of_home, say
 
 if TYPE_CHECKING:
     from duagc.pipeline.experiments.rule import Experiment
 
-experiment_app = typer.Typer(
+experiment_app = Commands(
     no_args_is_help=True, help="Claims, decided by rules that are written before the run."
 )
 app.add_typer(experiment_app, name="experiment")
@@ -169,4 +169,4 @@ def _named_folder(text: str) -> tuple[str, Path]:
     name, separator, folder = text.partition("=")
     if not separator or not name or not folder:
         raise DuagError(f"--recording {text}: expected NAME=FOLDER")
-    return name, Path(folder)
+    return name, Path(of_home(folder))

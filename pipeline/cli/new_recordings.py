@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from duagc.pipeline.cli.common import Force, Out, app, say
+from duagc.pipeline.cli.common import Force, Out, app, of_home, say
 
 
 @app.command()
@@ -108,7 +108,7 @@ def simulate(
         out,
         robots=robots,
         frames=frames,
-        scene=scene,
+        scene=of_home(scene),
         up=up,
         paradigm=paradigm,
         preview=preview,
@@ -238,14 +238,14 @@ def convert(
 
     def convert_to(folder: Path, force: bool) -> None:
         registry.convert(
-            dataset,
+            of_home(dataset),
             source,
             folder,
             robots=robots,
             force=force,
             options=said,
             options_file=options_file,
-            masks=masks or [],
+            masks=["=".join(map(of_home, mask.split("=", 1))) for mask in masks or ()],
         )
 
     if calibrate:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from duagc.pipeline.cli.bench import numbers, sizes_of
-from duagc.pipeline.cli.common import ConfigFile, Json, Overrides, Workers, bench_app
+from duagc.pipeline.cli.common import ConfigFile, Json, Overrides, Workers, bench_app, of_home
 
 
 @bench_app.command("robustness")
@@ -81,7 +81,7 @@ def bench_robustness(
     plan = robustness.RobustnessPlan(
         dials=dials,
         levels=tuple(numbers("--levels", levels, 0.01, 4.0)),
-        scene=scene,
+        scene=of_home(scene),
         robots=robots,
         frames=frames,
         size=sizes[0],
