@@ -130,3 +130,15 @@ def test_a_stand_in_that_lacks_a_function_names_the_package(
     assert str(raised.value) == (
         "open3d: libOpen3D.so: undefined symbol: eglNew; on Debian: apt-get install libegl1"
     )
+
+
+def test_an_interrupted_import_is_an_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a compiled module makes of Ctrl-C while it is set up."""
+
+    def stop() -> None:
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+
+    monkeypatch.setattr(open3d_import, "_imported", stop)
+    monkeypatch.setattr(open3d_import, "_kept", {"libusb-1.0.so.0": None})
+    with pytest.raises(KeyboardInterrupt):
+        open3d_import.import_open3d()

@@ -41,12 +41,15 @@ def import_open3d() -> Any:
         The module `open3d`.
     Raises:
         DuagError: it is not installed, or lacks a library that has no stand-in.
+        KeyboardInterrupt: the user stopped it.
     """
     while True:  # each time, the linker names one library that it lacks
         try:
             with _web_viewer_by_need():
                 return _imported()
         except ImportError as error:
+            if _is_interrupt(error):
+                raise KeyboardInterrupt from error
             missing = _NOT_FOUND.match(str(error))
             if missing is None or not _load_stand_in(missing[1]):
                 raise DuagError(_advice(str(error))) from error
@@ -94,6 +97,13 @@ def _load_stand_in(library: str) -> bool:
         return False
     _kept[library] = ctypes.CDLL(str(path))
     return True
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is what an import failed of: a compiled module says only that its initialization failed."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _advice(complaint: str) -> str:
