@@ -176,10 +176,16 @@ class StereoRig:
         Raises:
             DuagError: the cameras differ, or the right one is not to the right.
         """
-        if left != right or not baseline_m > 0:
+        pairs = {name: (value, getattr(right, name)) for name, value in vars(left).items()}
+        unequal = [f"{name} {a:.10g} and {b:.10g}" for name, (a, b) in pairs.items() if a != b]
+        if unequal:
             raise DuagError(
-                f"{where}: rectified cameras {left} and {right}, base line {baseline_m:g} m, expected the same "
-                "camera twice and a positive base line"
+                f"{where}: left and right rectified camera have {', '.join(unequal)}, expected the same"
+            )
+        if not baseline_m > 0:
+            raise DuagError(
+                f"{where}: base line is {baseline_m:g} m, expected more than 0; P[3] of the right CameraInfo must "
+                "be -f b, or left and right are swapped"
             )
         return StereoRig(left, baseline_m, options)
 

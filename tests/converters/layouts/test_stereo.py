@@ -167,6 +167,21 @@ def test_a_point_lies_in_one_row_of_both_rectified_images(
         assert np.abs(error_px).max() < 0.1  # maps are read between pixels
 
 
+def test_rectified_cameras_that_do_not_fit_are_refused_by_what_is_wrong() -> None:
+    left = PinholeCamera(320, 240, np.float64(262.4), np.float64(262.4), 160.0, 120.0)
+    with pytest.raises(DuagError) as raised:
+        StereoRig.rectified(left, left, -0.11, "here")
+    assert str(raised.value) == (
+        "here: base line is -0.11 m, expected more than 0; P[3] of the right CameraInfo must be -f b, "
+        "or left and right are swapped"
+    )
+    with pytest.raises(DuagError) as raised:
+        StereoRig.rectified(left, PinholeCamera(320, 200, 262.4, 262.5, 160.0, 120.0), 0.11, "here")
+    assert str(raised.value) == (
+        "here: left and right rectified camera have height 240 and 200, fy 262.4 and 262.5, expected the same"
+    )
+
+
 def test_one_fisheye_alone_is_refused() -> None:
     pinhole = raw(LEFT, D_LEFT)
     fisheye = RawCamera(RIGHT.matrix(), FISHEYE, RIGHT.width, RIGHT.height, True)
