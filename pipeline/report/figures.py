@@ -19,6 +19,7 @@ Numbers = NDArray[Any]
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000", "#444444")
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 INK, FAINT, GRID = "#22303c", "#6b7a87", "#e3e8ec"
+LONG, KEPT = 16, 12  # letters: of a word that is too long for a legend, and of what becomes of it
 
 _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "duagc",
@@ -45,6 +46,18 @@ _STYLE: dict[Any, Any] = {
 def color_of(index: int) -> str:
     """Color of the robot (or other series) number `index`."""
     return COLORS[index % len(COLORS)]
+
+
+def shortened(label: str) -> str:
+    """A label whose long words, names of robots, lack their middle: four in a row leave room for the axes.
+
+    Args:
+        label: words with spaces between them.
+    """
+    head, tail = KEPT // 2, (KEPT - 1) // 2
+    return " ".join(
+        word if len(word) <= LONG else f"{word[:head]}…{word[-tail:]}" for word in label.split(" ")
+    )
 
 
 def _styled(draw: Callable[..., Figure]) -> Callable[..., str]:
@@ -105,7 +118,7 @@ def top_view(ways: Sequence[Mapping[str, Any]]) -> Figure:
                 *way["true"].T, color="#9aa7b1", linewidth=4.5, alpha=0.55, solid_capstyle="round", zorder=1
             )
         axes.plot(*way["before"].T, color=color, linewidth=1.2, linestyle=(0, (3, 2)), zorder=2)
-        axes.plot(*way["after"].T, color=color, zorder=3, label=way["robot"])
+        axes.plot(*way["after"].T, color=color, zorder=3, label=shortened(way["robot"]))
         axes.plot(*way["after"][0], marker=MARKS[i % len(MARKS)], markersize=8, color=color, zorder=4)
     axes.plot([], [], color=INK, label="after consensus")
     axes.plot([], [], color=INK, linewidth=1.2, linestyle=(0, (3, 2)), label="before")
@@ -148,7 +161,7 @@ def lines(
             x[keep],
             y[keep],
             color=color_of(i),
-            label=name,
+            label=shortened(name),
             marker=MARKS[i % len(MARKS)] if np.count_nonzero(keep) <= 40 else None,
             markersize=4,
             linestyle="-" if i == 0 else (0, (4, 1 + i)),  # equal curves stay visible under each other
@@ -198,6 +211,8 @@ def bars(names: Sequence[str], parts: Mapping[str, Sequence[float]], x_label: st
     for i, (part, values) in enumerate(parts.items()):
         axes.barh(names, values, left=left, color=color_of(i), label=part, height=0.62)
         left = left + np.asarray(values, dtype=np.float64)
+    if (labels := [shortened(name) for name in names]) != list(names):
+        axes.set_yticks(range(len(names)), labels)  # equal ones stay bars of their own
     axes.invert_yaxis()
     axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.grid(visible=False, axis="y")
@@ -224,7 +239,7 @@ def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
             axis.set_minor_formatter(NullFormatter())
     for i, (name, pairs) in enumerate(bins.items()):
         x, y = 1e3 * np.array(pairs).T
-        axes.plot(x, y, color=color_of(i), marker=MARKS[i % len(MARKS)], markersize=5, label=name)
+        axes.plot(x, y, color=color_of(i), marker=MARKS[i % len(MARKS)], markersize=5, label=shortened(name))
     axes.set_xlabel("predicted error (mm, root mean square)")
     axes.set_ylabel("observed error (mm, root mean square)")
     _legend_above(axes, len(bins) + bool(values))
@@ -263,7 +278,7 @@ def map_sizes(robots: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
                     linestyle=line,
                     marker=MARKS[i % len(MARKS)],
                     markersize=5,
-                    label=None if kind else robot,
+                    label=None if kind else shortened(robot),
                 )
             if kind:
                 axes.plot([], [], color=INK, linestyle=line, label=kind)

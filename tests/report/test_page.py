@@ -207,3 +207,35 @@ def test_the_page_says_why_every_loop_closure_was_kept_or_rejected(html):
     text = re.sub(r"<[^>]+>", " ", html)
     assert "Every candidate and why it was kept or rejected (4)" in text
     assert "few_matches" in text
+
+
+def test_long_names_leave_room_for_the_axes():
+    """Else Matplotlib warns that it laid nothing out, and draws over the edge."""
+    names = [f"robot_{'of_the_upper_floor_' * 3}{i}" for i in range(4)]
+    x, line = np.arange(4.0), np.random.default_rng(0).normal(size=(4, 2))
+    ways = [
+        {"robot": name, "index": i, "before": line, "after": line, "true": line}
+        for i, name in enumerate(names)
+    ]
+    links = [f"{a} to {b}" for a in names for b in names if a != b]
+    drawn = [
+        figures.top_view(ways),
+        figures.lines(dict.fromkeys(names, (x, x + 1)), "round", "m", log=True, level=0.1),
+        figures.bars(links, {"delivered": [1] * len(links), "lost": [0] * len(links)}, "packets"),
+        figures.bars([f"frontend, {name}" for name in names], {"wall": [1] * 4}, "seconds"),
+        figures.reliability({name: [(1e-3, 2e-3)] for name in names}),
+    ]
+    for svg in drawn:
+        assert all(f">{name}<" not in svg for name in names)
+        assert "robot_…oor_3" in svg
+
+
+def test_bars_of_names_that_look_alike_stay_apart():
+    alike = [f"robot_{'x' * 20}{i}{'y' * 20}" for i in range(3)]
+    svg = figures.bars(alike, {"wall": [1, 2, 3]}, "seconds")
+    assert svg.count("robot_…yyyyy<") == 3
+
+
+def test_names_of_a_few_letters_are_drawn_whole():
+    for label in ("alpha", "november and charlie", "kitchen_robot_12", "frontend, november-2"):
+        assert figures.shortened(label) == label
