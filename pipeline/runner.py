@@ -14,6 +14,7 @@ from pathlib import Path
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.atomic_folder import check_apart, new_folder
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.packages import check_packages
 from duagc.pipeline.config.run import RunConfig
@@ -65,6 +66,10 @@ def run(
     Raises:
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
+    if not isinstance(config, RunConfig):
+        raise DuagError(
+            f"config is of type {type(config).__name__}, expected a RunConfig; load_config makes one"
+        )
     check_packages(config)
     recording_path, out, store = Path(recording_path), Path(out), None if store is None else Path(store)
     check_apart(out, [recording_path] if store is None else [recording_path, store])

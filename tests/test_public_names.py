@@ -66,3 +66,5 @@ def test_places_may_be_texts(tmp_path: Path) -> None:
         duagc.replay(run, str(fake.recording), ["alpha"], print)
     with pytest.raises(duagc.DuagError, match="exists already"):
         duagc.run(str(fake.recording), run, duagc.RunConfig(), store=str(tmp_path / "store"))
+    with pytest.raises(duagc.DuagError, match="config is of type dict, expected a RunConfig"):
+        duagc.run(fake.recording, tmp_path / "out", {})  # type: ignore[arg-type]
