@@ -236,11 +236,15 @@ def format_report(report: Report) -> str:
     out = []
     for robot, row in report.robots.items():
         depth = row["depth_m"]
-        reach = f"depth {depth[0]:.2f} {depth[1]:.2f} {depth[2]:.2f} m (1, 50, 99 %)" if depth else "no depth"
+        reach = "no depth"
+        if depth:
+            share = f"{row['with_depth']:.0%}" if row["with_depth"] > 0.005 else "less than 1%"
+            reach = (
+                f"depth {depth[0]:.2f} {depth[1]:.2f} {depth[2]:.2f} m (1, 50, 99 %) in {share} of the pixels"
+            )
         moved = "" if row["reprojection"] is None else f", reprojection {row['reprojection']:.2%}"
         keyframes = f"{row['keyframes_from']} to {row['keyframes_to']} keyframes"
-        seen = f"{reach} in {row['with_depth']:.0%} of the pixels{moved}"
-        out.append(f"{robot}: {row['frames']} frames, {keyframes}, {seen}")
+        out.append(f"{robot}: {row['frames']} frames, {keyframes}, {reach}{moved}")
     e = report.estimate
     unit, name = (60, "minutes") if e["seconds_to"] > 120 else (1, "seconds")
     span = f"{e['seconds_from'] / unit:.0f} to {e['seconds_to'] / unit:.0f} {name}"

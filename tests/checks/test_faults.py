@@ -263,6 +263,26 @@ def test_a_recording_given_twice_is_an_error(sound: Path, tmp_path: Path) -> Non
     assert not report.sound
 
 
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        (0.77, "in 77% of the pixels"),
+        (0.0051, "in 1% of the pixels"),
+        (0.004, "in less than 1% of the pixels"),
+    ],
+)
+def test_a_small_share_of_depth_is_not_none(share: float, words: str) -> None:
+    row: dict[str, Any] = {"frames": 9, "reprojection": None, "keyframes_from": 1, "keyframes_to": 2}
+    estimate = {"seconds_from": 1.0, "seconds_to": 2.0, "measured_stages": 0, "bytes": 1e6}
+    robots = {
+        "alpha": row | {"depth_m": [1.0, 2.0, 3.0], "with_depth": share},
+        "bravo": row | {"depth_m": None, "with_depth": 0.0},
+    }
+    first, second, *_ = check.format_report(check.Report("rec", [], robots, estimate)).splitlines()
+    assert first == f"alpha: 9 frames, 1 to 2 keyframes, depth 1.00 2.00 3.00 m (1, 50, 99 %) {words}"
+    assert second == "bravo: 9 frames, 1 to 2 keyframes, no depth"
+
+
 def seldom_depth(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
     """Depth of every fifth image alone: the frames between share it."""
     depths = [record.log_time_ns for record in records if record.topic == DEPTH]
