@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,6 +17,7 @@ from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.steps import agent_input
 from duagc.pipeline.viewing.inspection import Inspector, format_facts, format_loop_closures
+from tests.fixtures import fake_run
 
 
 def test_what_happened_can_be_asked_for(small_run: Path) -> None:
@@ -48,6 +50,25 @@ def test_what_happened_can_be_asked_for(small_run: Path) -> None:
     ):
         with pytest.raises(DuagError, match=complaint):
             ask()
+
+
+@pytest.mark.parametrize(
+    ("count", "of_rounds", "of_packets"),
+    [
+        (0, "no round", "no packet"),
+        (1, "round 0 alone", "packet 0 alone"),
+        (5, "rounds 0 to 4", "packets 0 to 4"),
+    ],
+)
+def test_a_number_that_is_too_large_is_next_to_those_that_are_there(
+    tmp_path: Path, count: int, of_rounds: str, of_packets: str
+) -> None:
+    inspector = Inspector(RunFolder(fake_run.make(tmp_path).run))
+    vars(inspector)["_session"] = SimpleNamespace(rounds=count, packets=[None] * count)
+    with pytest.raises(DuagError, match=f"has {of_rounds}, found --round {count}$"):
+        inspector.round(count)
+    with pytest.raises(DuagError, match=f"has {of_packets}, found --packet {count}$"):
+        inspector.packet(count)
 
 
 def test_every_candidate_of_a_run_can_be_asked_for_with_its_reason(small_run: Path) -> None:

@@ -59,7 +59,8 @@ class Inspector:
         """
         if not 0 <= index < self._session.rounds:
             raise DuagError(
-                f"{self.run.path / 'exchange.mcap'}: has {self._session.rounds} rounds, found --round {index}"
+                f"{self.run.path / 'exchange.mcap'}: has {_numbered('round', self._session.rounds)}, "
+                f"found --round {index}"
             )
         return {
             "round": index,
@@ -158,7 +159,8 @@ class Inspector:
         packets = self._session.packets
         if not 0 <= number < len(packets):
             raise DuagError(
-                f"{self.run.path / 'exchange.mcap'}: has {len(packets)} packets, found --packet {number}"
+                f"{self.run.path / 'exchange.mcap'}: has {_numbered('packet', len(packets))}, "
+                f"found --packet {number}"
             )
         p = packets[number]
         header = _parsed(p)
@@ -279,6 +281,11 @@ class Inspector:
                     }
                 )
         return out
+
+
+def _numbered(thing: str, count: int) -> str:
+    """Which there are of things that count from 0."""
+    return f"{thing}s 0 to {count - 1}" if count > 1 else f"{thing} 0 alone" if count else f"no {thing}"
 
 
 def _parsed(p: RecordedPacket) -> Packet:
