@@ -29,6 +29,7 @@ from duagc.pipeline.recording import (
     RANGE_SIGMA_KEY,
     LogWriter,
 )
+from duagc.pipeline.recording.copies import image_digest
 from duagc.schemas import topics
 
 
@@ -77,6 +78,7 @@ class RobotWriter:
         self._valid = mask_of_user(name, camera.width, camera.height)
         self._regions = FoundRegions() if find_regions else None
         self._lens: Lens | None = None
+        self._colors: set[int] = set()  # digests of the color images
         self._shares: dict[str, float] = {}  # of the pixels that were found to show something else
         # topic of a sensor's pose in the camera that is still to be written
         self._sensors: dict[str, NDArray[np.float64]] = {}
@@ -189,6 +191,7 @@ class RobotWriter:
             self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
             self._write_valid(stamp_ns)
         index = len(self._stamps)
+        self._colors.add(image_digest(color))
         if self._regions is not None:
             self._regions.add(index, stamp_ns, color, depth)
         self._stamps.append(int(stamp_ns))
@@ -381,6 +384,7 @@ class RobotWriter:
             "sensors": self.sensors,
             "digests": {self._log.path.name: self._log.digest},
             "path": None,
+            "color_digests": sorted(self._colors),
         }
         if self._valid is not None:
             summary["masked_share"] = float(np.mean(~self._valid))

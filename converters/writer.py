@@ -38,6 +38,7 @@ from duagc.pipeline.recording import (
     RECORDING_FORMAT,
     RECORDING_SCHEMA,
 )
+from duagc.pipeline.recording.copies import copies
 
 OPTIONS_FILE: ContextVar[dict[str, str] | None] = ContextVar("options_file", default=None)
 """Name and text of the file that the converter's options came from; recordings keep it."""
@@ -94,6 +95,7 @@ class RecordingWriter:
         self.clocks: dict[str, Any] = {}
         self._source, self._converter, self._force = dict(source or {}), converter, force
         self._robots: dict[str, dict[str, Any]] = {}
+        self._colors: dict[str, set[int]] = {}  # digests of the color images, by robot
         self._open: list[RobotWriter] = []
         self._geometry: str | None = None
         self._place = ExitStack()
@@ -134,6 +136,7 @@ class RecordingWriter:
         """
         row = dict(summary)
         robot = row.pop("robot")
+        self._colors[robot] = set(row.pop("color_digests"))
         if robot in self._robots:
             raise ValueError(f"robot {robot} is in the recording already")
         for name, words in FOUND.items():
@@ -172,6 +175,11 @@ class RecordingWriter:
                     f"{robot}: depth moved by its true poses differs by {row['reprojection_median_m']:.3f} m at "
                     f"{row['median_depth_m']:.2f} m (medians), far less than without a motion: poses or depth are rough"
                 )
+        self.warnings += [
+            f"{other}: {same} of its color images are those of {robot}, byte for byte: what one camera saw once would "
+            "count twice"
+            for robot, other, same in copies(self._colors)
+        ]
         unknown = sorted(set(USER_MASKS.get() or {}) - {ALL_ROBOTS} - set(self._robots))
         if unknown:
             names = ", ".join(sorted(self._robots))

@@ -40,6 +40,13 @@ def test_every_parameter_of_a_public_name_has_a_line_of_its_own(name: str) -> No
     assert not missing, f"duagc.{name}: Args: lacks a line for {', '.join(missing)}"
 
 
+@pytest.mark.parametrize(
+    "name", sorted(name for name in duagc.__all__ if inspect.ismodule(getattr(duagc, name)))
+)
+def test_a_module_may_be_the_first_name_that_is_used(name: str) -> None:
+    subprocess.run([sys.executable, "-c", f"from duagc import {name}"], check=True)
+
+
 def test_the_package_imports_nothing_heavy() -> None:
     heavy = {"numpy", "torch", "cv2", "rerun", "open3d", "scipy", "mcap", "pydantic"}
     code = f"import sys, duagc; print(sorted({heavy} & set(sys.modules)))"

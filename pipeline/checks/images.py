@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -18,7 +17,7 @@ from duagc.pipeline.frontend.failure import saturated_share_of
 from duagc.pipeline.kernels.pyramid import gray_of_color
 from duagc.pipeline.messages import unpack_stamp
 from duagc.pipeline.recording import Record, RgbdFrame
-from duagc.pipeline.recording.copies import copies
+from duagc.pipeline.recording.copies import copies, image_digest
 from duagc.pipeline.recording.greatest_depth import SATURATED, greatest_apart
 from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics as topic_table
@@ -53,7 +52,7 @@ class Repeats:
     def add(self, record: Record) -> None:
         """Take in the next image."""
         image = record.proto()
-        digest = zlib.crc32(image.data)
+        digest = image_digest(image.data)
         empty = not image.data.strip(b"\0")
         self.empty += empty
         same = digest == self._last and len(self.stamps_ns) > 0 and not empty

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from itertools import combinations
 
@@ -11,11 +12,20 @@ MOST_SHARED, MOST_SHARE = (
 )  # images that may be the same by chance, as black ones: so many, or that share
 
 
+def image_digest(data: bytes) -> int:
+    """A number that differs between images, but by chance.
+
+    Args:
+        data: of the image, as it is in the log.
+    """
+    return zlib.crc32(data)
+
+
 def copies(digests: Mapping[str, set[int]]) -> list[tuple[str, str, int]]:
     """Pairs of robots with color images in common, and how many.
 
     Args:
-        digests: of the color images, by robot.
+        digests: `image_digest` of the color images, by robot.
     """
     found = []
     for a, b in combinations(sorted(digests), 2):

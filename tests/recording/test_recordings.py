@@ -196,3 +196,21 @@ def test_missing_parts_of_a_recording(tmp_path: Path) -> None:
     (out / "alpha.mcap").unlink()
     with pytest.raises(DuagError, match=r"alpha\.mcap: no such file"):
         Recording(out).log("alpha")
+
+
+def test_robots_with_the_same_images_are_named(tmp_path: Path) -> None:
+    """One recording given twice; images of no light may be the same."""
+
+    def written(out: Path, same: int) -> list[str]:
+        with RecordingWriter(out) as recording:
+            for robot, name in enumerate(robot_names(2)):
+                with recording.robot(name, CAMERA, 0.001) as writer:
+                    for k in range(8):
+                        shown = 10 * k + (robot if k >= same else 0)
+                        writer.add_frame(1000 * k + 7 * robot, png(image(shown)), "png", depth(k))
+        return Recording(out).description["warnings"]
+
+    assert written(tmp_path / "other", 2) == []
+    words = "bravo: 3 of its color images are those of alpha, byte for byte: what one camera saw once would count twice"
+    assert written(tmp_path / "copy", 3) == [words]
+    assert "color_digests" not in Recording(tmp_path / "copy").description["robots"]["alpha"]
