@@ -15,6 +15,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_toml
 
+EXPECTED = {"tuple_type": "expected a list in brackets, such as [1, 2], texts in quotes"}
+"""What is said of a wrong value in place of pydantic's words, by the type of its error."""
+
 
 class Config(BaseModel):
     """Base of every section: immutable, unknown names refused, defaults validated."""
@@ -103,7 +106,8 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
             ) from error
         if first["type"] == "value_error":
             raise DuagError(f"{source}: {first['ctx']['error']}") from error
-        raise DuagError(f"{source}: {name} = {first['input']!r}: {first['msg']}") from error
+        complaint = EXPECTED.get(first["type"], first["msg"])
+        raise DuagError(f"{source}: {name} = {first['input']!r}: {complaint}") from error
 
 
 def _said_where(name: str, source: str, overrides: Sequence[str]) -> str:

@@ -91,6 +91,11 @@ def test_a_section_is_introduced_by_its_first_paragraph() -> None:
     assert Whole.summary() == "All of it."
 
 
+def test_a_number_for_a_list_is_refused_in_words_of_toml() -> None:
+    with pytest.raises(DuagError, match=r"strides = 3: expected a list in brackets, such as \[1, 2\]"):
+        load_config(RunConfig, overrides=["frontend.tracking.strides=3"])
+
+
 def test_overrides_win_over_the_file(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text("seed = 3\n[link]\nloss_probability = 0.5\n")
     config = load_config(Whole, tmp_path / "c.toml", ["link.loss_probability=0.75", "link.name=wire"])
