@@ -225,9 +225,11 @@ class Inspector:
         own = one.own_map.gaussians
         rows = np.flatnonzero(own.ids == gaussian_id)
         if not len(rows):
+            ids = (
+                f"an id from {own.ids.min()} to {own.ids.max()}" if len(own) else "a robot whose map has some"
+            )
             raise DuagError(
-                f"{one.folder / 'frontend.mcap'}: no Gaussian {gaussian_id} in the map of {robot}, "
-                f"expected an id from {own.ids.min(initial=0)} to {own.ids.max(initial=0)}"
+                f"{one.folder / 'frontend.mcap'}: no Gaussian {gaussian_id} in the map of {robot}, expected {ids}"
             )
         row = slice(int(rows[0]), int(rows[0]) + 1)
         picked = own.select(row)
