@@ -34,7 +34,7 @@ class Repeats:
     Attributes:
         stamps_ns: publish times in the order of the log.
         digests: of all images.
-        empty: images of nothing but zeros: depth that is unknown everywhere. They repeat nothing.
+        empty: depth images that are zero, unknown, everywhere. They repeat nothing.
         repeated: images that are the one before once more.
         longest: most of them in a row, the first one included.
         other_stamps: images that state another time than their message.
@@ -53,7 +53,7 @@ class Repeats:
         """Take in the next image."""
         image = record.proto()
         digest = image_digest(image.data)
-        empty = not image.data.strip(b"\0")
+        empty = len(image.data) > 0 and not image.data.strip(b"\0")
         self.empty += empty
         same = digest == self._last and len(self.stamps_ns) > 0 and not empty
         self._run = self._run + 1 if same else 1

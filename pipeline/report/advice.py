@@ -19,16 +19,16 @@ CERTAIN_SIGMAS = 4.0
 """Scales of depth that differ by more standard deviations are said to."""
 
 
-def advice(run: RunFolder, source: Recording) -> list[str]:
+def advice(run: RunFolder, source: Recording, session: Session) -> list[str]:
     """Sentences on what is wrong with the recording, most often none.
 
     Args:
         run: that was measured.
         source: its recording.
+        session: the exchange of the run.
     """
-    return [
-        said for said in (calibration_advice(run, source), depth_scale_advice(run), moved_advice(run)) if said
-    ]
+    said = calibration_advice(run, source), depth_scale_advice(run), moved_advice(session)
+    return [sentence for sentence in said if sentence]
 
 
 def calibration_advice(run: RunFolder, source: Recording) -> str:
@@ -75,22 +75,22 @@ def depth_scale_advice(run: RunFolder) -> str:
     )
 
 
-def moved_advice(run: RunFolder) -> str:
-    """A sentence that names robots between whose recordings something moved, by which they are not joined.
+def moved_advice(session: Session) -> str:
+    """A sentence that names robots between whose views something moved, by which they are not joined.
 
     Args:
-        run: that was measured.
+        session: the exchange of the run.
     """
     moved = Counter(
         f"{min(d.robot, d.peer)} and {max(d.robot, d.peer)}"
-        for d in Session(run).loop_closures
+        for d in session.loop_closures
         if follows_moved(d)
     )
     if not moved:
         return ""
     pairs = ", ".join(f"{pair} ({count})" for pair, count in sorted(moved.items()))
     return (
-        f"Something moved between the recordings of {pairs} and stands in their maps where each saw it; "
+        f"Something moved between the views of {pairs} and stands in their maps where each saw it; "
         "loop closures that follow it, so many, are left out."
     )
 

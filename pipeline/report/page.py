@@ -81,7 +81,7 @@ def content(run: RunFolder, source: Recording, workers: int) -> dict[str, Any]:
         "subtitle": _subtitle(metrics),
         "sections": SECTIONS,
         "cards": cards(metrics, reasons),
-        **_paths_content(run, source, metrics),
+        **_paths_content(run, source, session),
         **coverage_content(run, metrics),
         "comparison_sets": [labels.VIEW_SETS[s] for s in labels.compared_sets(metrics)],
         "comparison_columns": list(labels.comparison_columns(metrics).values()),
@@ -168,7 +168,7 @@ def _known(metrics: dict[str, Any]) -> str:
 # --- paths -------------------------------------------------------------------------------------------------------
 
 
-def _paths_content(run: RunFolder, source: Recording, metrics: dict[str, Any]) -> dict[str, Any]:
+def _paths_content(run: RunFolder, source: Recording, session: Session) -> dict[str, Any]:
     ways = paths(run, source)
     shown = [way for way in ways if way.component == run.robots[run.largest_component[0]].component]
     others = [way.robot for way in ways if way not in shown]
@@ -181,8 +181,8 @@ def _paths_content(run: RunFolder, source: Recording, metrics: dict[str, Any]) -
             if all(isinstance(way.true, Absent) for way in shown)
             else " Ground truth is missing for some robots."
         )
-    lead = " ".join([lead, *advice(run, source)])
-    columns = labels.without_empty(labels.ROBOT, list(metrics["robots"].values()))
+    lead = " ".join([lead, *advice(run, source, session)])
+    columns = labels.without_empty(labels.ROBOT, list(run.metrics["robots"].values()))
     return {
         "paths_lead": lead,
         "paths_chart": pictures.svg_uri(_top_view(shown, list(run.robots))),
@@ -191,7 +191,9 @@ def _paths_content(run: RunFolder, source: Recording, metrics: dict[str, Any]) -
             {
                 "robot": name,
                 "color": figures.color_of(i),
-                "values": [labels.text(column, metrics["robots"][name].get(column)) for column in columns],
+                "values": [
+                    labels.text(column, run.metrics["robots"][name].get(column)) for column in columns
+                ],
             }
             for i, name in enumerate(run.robots)
         ],

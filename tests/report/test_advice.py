@@ -9,7 +9,7 @@ import pytest
 
 from duagc.pipeline.exchange.verification import Verdict
 from duagc.pipeline.report import advice
-from duagc.pipeline.report.advice import FEWEST_PAIRS, calibration_advice, depth_scale_advice
+from duagc.pipeline.report.advice import FEWEST_PAIRS, calibration_advice, depth_scale_advice, moved_advice
 
 
 def run_of(calibration: tuple[str, ...] = (), pairs: int = 40, **off_px: float | None) -> Any:
@@ -67,13 +67,13 @@ def test_robots_whose_depth_is_longer_are_named() -> None:
     assert depth_scale_advice(SimpleNamespace(metrics={"robots": {"alpha": {}}})) == ""
 
 
-def test_robots_between_whose_recordings_something_moved_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_robots_between_whose_views_something_moved_are_named() -> None:
     def decided(robot: str, peer: str, verdict: Verdict) -> SimpleNamespace:
         return SimpleNamespace(robot=robot, peer=peer, verdict=verdict.value)
 
     decisions = [decided("bravo", "alpha", Verdict.SOMETHING_MOVED)] * 3
     decisions += [decided("bravo", "charlie", Verdict.KEPT), decided("alpha", "charlie", Verdict.MOVED)]
-    monkeypatch.setattr(advice, "Session", lambda run: SimpleNamespace(loop_closures=run))
-    assert "the recordings of alpha and bravo (3)" in advice.moved_advice(decisions)
-    assert "charlie" not in advice.moved_advice(decisions)
-    assert advice.moved_advice(decisions[3:]) == ""
+    said = moved_advice(SimpleNamespace(loop_closures=decisions))
+    assert "the views of alpha and bravo (3)" in said
+    assert "charlie" not in said
+    assert moved_advice(SimpleNamespace(loop_closures=decisions[3:])) == ""
