@@ -1,24 +1,15 @@
-"""Loop closures that show something that moved between two recordings, and not the place.
-
-Where a chair was moved, two views of it agree on two motions: of the room, and of the chair. What moves is smaller than
-the place, so that of two motions that one pair of views shows, the one whose features spread wider is that of the place
-(`verification.verify`). Other pairs see the chair alone. They are known as well, for they agree with the motions that
-such pairs ascribe to something that moved.
-"""
+"""Candidates of two robots that show something that moved between their recordings (`posegraph.moved_things`)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.exchange.loop_closing import Tried
 from duagc.pipeline.exchange.verification import Verdict
-from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph.loop_closures import Group, KeyframePoses, consistent
+from duagc.pipeline.posegraph.loop_closures import KeyframePoses
+from duagc.pipeline.posegraph.moved_things import following_moved_things
 
 
 def without_moved_things(
@@ -32,32 +23,19 @@ def without_moved_things(
         peer: the neighbor's keyframes, likewise.
         config: which loop closures agree.
     """
-    held = [k for k, t in enumerate(tried) if t.result.closure is not None]
-    moved = [t.result.moved for t in tried if t.result.moved is not None]
+    held = [(k, c) for k, t in enumerate(tried) if (c := t.result.closure) is not None]
+    following = following_moved_things(
+        [closure for _, closure in held],
+        [t.result.tentative for t in tried if t.result.tentative is not None and t.result.shown is None],
+        [shown for t in tried if (shown := t.result.shown) is not None],
+        own=own,
+        peer=peer,
+        config=config,
+    )
     out = list(tried)
-    if not moved:
-        return out
-    closures = [c for k in held if (c := tried[k].result.closure) is not None]
-    found = consistent([*closures, *moved], own, peer, config)
-    if found.T_ownmap_peermap is None:
-        return out
-    groups = [Group(found.keep, found.T_ownmap_peermap), *found.others]
-    # whether pairs of views that show two motions ascribe those of a group to the place
-    of_place = np.array([t.result.moved is not None for t in tried])[held]
-    votes = [int(of_place[g.keep[: len(held)]].sum()) - int(g.keep[len(held) :].sum()) for g in groups]
-    place = int(np.argmax(votes))
-    if votes[place] <= 0:
-        return out
-    for group, vote in zip(groups, votes, strict=True):
-        if vote < 0:
-            apart_m, _ = se3.distance(groups[place].T_ownmap_peermap, group.T_ownmap_peermap)
-            _leave_out(out, np.array(held)[group.keep[: len(held)]], float(apart_m))
-    return out
-
-
-def _leave_out(tried: list[Tried], which: NDArray[np.int64], apart_m: float) -> None:
-    """Take the loop closures of some candidates away."""
-    for k in which.tolist():
+    for at, apart_m in following.items():
+        k = held[at][0]
         detail = f"places the map {apart_m:.2f} m from where the surroundings do"
         result = replace(tried[k].result, verdict=Verdict.SOMETHING_MOVED, detail=detail, closure=None)
-        tried[k] = replace(tried[k], result=result)
+        out[k] = replace(tried[k], result=result)
+    return out

@@ -15,8 +15,8 @@ from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.verification import Verified, verify
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample, RectifiedFeatures
 from duagc.pipeline.network.packets import MalformedError
+from duagc.pipeline.registration.feature_motion import motion_from_rectified
 from duagc.pipeline.registration.features import Features
-from duagc.pipeline.registration.geometric_verification import motion_from_rectified
 
 
 @dataclass

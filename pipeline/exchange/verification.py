@@ -16,12 +16,13 @@ from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.posegraph.moved_things import TwoMotions
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 from duagc.pipeline.registration import RgbdPyramid, geometric_verification
+from duagc.pipeline.registration.feature_motion import FeatureMotion, motion_from_features
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.geometric_verification import (
     Failure,
-    FeatureMotion,
     GeometricVerification,
     VerificationView,
 )
@@ -55,8 +56,8 @@ class Verified:
         inliers: matches that agree on one motion.
         detail: with numbers.
         closure: the loop closure, if the candidate was kept.
-        tentative: what matched features agree on where registration failed; its information is zero.
-        moved: the motion of something that moved between the two views, if they show one.
+        tentative: what matched features agree on where registration failed.
+        shown: the motions of the place and of something that moved between the two views, if they show both.
     """
 
     verdict: Verdict
@@ -65,7 +66,7 @@ class Verified:
     detail: str = ""
     closure: LoopClosure | None = None
     tentative: LoopClosure | None = None
-    moved: LoopClosure | None = None
+    shown: TwoMotions | None = None
 
 
 def within_view(
@@ -130,11 +131,12 @@ def verify(
         rng=rng,
         both=True,
     )
-    if found.another is None:
-        return _judged(candidate, found, config)
-    # what moves between two views is smaller than what does not
-    moved, place = sorted((found, found.another), key=lambda motion: motion.features.spread_m)
-    return replace(_judged(candidate, place, config), moved=_judged(candidate, moved, config).closure)
+    judged, features = _judged(candidate, found.of_place, config), found.of_place.features
+    moved = None if found.of_moved is None else _judged(candidate, found.of_moved, config).closure
+    if moved is None or features.T_first_second is None:
+        return judged
+    place = LoopClosure(*candidate.ends, features.T_first_second, _certainty(features.information, config))
+    return replace(judged, shown=TwoMotions(place, moved))
 
 
 def _judged(candidate: Candidate, found: GeometricVerification, config: VerificationConfig) -> Verified:
@@ -144,7 +146,8 @@ def _judged(candidate: Candidate, found: GeometricVerification, config: Verifica
     if found.failure is None:
         closure = LoopClosure(*candidate.ends, found.T_first_second, _certainty(found.information, config))
     elif found.features.T_first_second is not None and found.features.accepted:
-        tentative = LoopClosure(*candidate.ends, found.features.T_first_second, np.zeros((6, 6)))
+        certainty = _certainty(found.features.information, config)
+        tentative = LoopClosure(*candidate.ends, found.features.T_first_second, certainty)
     return Verified(verdict, found.features.matches, found.features.inliers, detail, closure, tentative)
 
 
@@ -163,7 +166,7 @@ def _verified_by_gicp(
     if config.method == "gicp":
         found = FeatureMotion(np.eye(4), len(theirs), 0, 0)
     else:
-        found = geometric_verification.motion_from_features(own, sample.features, config, rng)
+        found = motion_from_features(own, sample.features, config, rng)
     if found.T_first_second is None:
         return Verified(Verdict.FEW_MATCHES, found.matches, 0, f"{found.needed} needed")
     if not found.accepted:

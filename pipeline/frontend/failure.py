@@ -43,6 +43,7 @@ class Reason(Enum):
     OBSTRUCTED = "obstructed"
     CONTRADICTION = "contradiction"
     UNCONFIRMED = "unconfirmed"
+    SOMETHING_MOVED = "something_moved"
     SMALL_SUBMAP = "small_submap"
     OTHER_COMPONENT = "other_component"
     CONTRADICTED_BY_FEATURES = "contradicted_by_features"

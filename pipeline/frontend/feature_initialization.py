@@ -15,8 +15,8 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.current_frame import CurrentFrame
 from duagc.pipeline.frontend.tracking_state import TrackingState
+from duagc.pipeline.registration.feature_motion import motion_from_features
 from duagc.pipeline.registration.features import matches
-from duagc.pipeline.registration.geometric_verification import motion_from_features
 
 
 def initial_motions(state: TrackingState, frame: CurrentFrame) -> Iterator[tuple[int, Array]]:

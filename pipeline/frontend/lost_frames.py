@@ -26,11 +26,11 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.feature_judgment import judge_motion
-from duagc.pipeline.registration.features import Features
-from duagc.pipeline.registration.geometric_verification import (
+from duagc.pipeline.registration.feature_motion import (
     features_agree,
     motion_from_features,
 )
+from duagc.pipeline.registration.features import Features
 
 LOOKED_FOR = frozenset(
     {

@@ -22,8 +22,8 @@ from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.feature_judgment import angles_between, judge_motion
+from duagc.pipeline.registration.feature_motion import features_agree, follows_something_moved
 from duagc.pipeline.registration.features import matches
-from duagc.pipeline.registration.geometric_verification import features_agree
 
 
 class PoseCheck(Protocol):
@@ -209,6 +209,24 @@ class FeaturesConfirm:
         return candidate if expected and not state.is_long_lost(frame.stamp_ns) else Reason.OBSTRUCTED
 
 
+class DoesNotFollowMovedThings:
+    """Where features of frame and keyframe agree on two motions, the camera must be where the wider spread ones say.
+
+    What moved while the camera was lost, a chair or a table, may fill more of its view than the place does, and dense
+    registration ends there even from the right start.
+    """
+
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
+        k, limits = candidate.keyframe_index, state.config.tracking.relocalization
+        # the draws only choose which samples are tried: the same in every run
+        rng = random_streams.generator(0, "moved_things", frame=frame.frame_index, keyframe=k)
+        features, T = state.keyframes[k].features, candidate.result.T_reference_target
+        moved = follows_something_moved(features, frame.features, T, limits, rng)
+        return Reason.SOMETHING_MOVED if moved else candidate
+
+
 class FeaturesDoNotContradict:
     """The features of the frame must not say, by the motion that they agree on, that the camera is elsewhere.
 
@@ -296,6 +314,9 @@ PLAUSIBLE: tuple[PoseCheck, ...] = (
     FeaturesConfirm(),
 )
 """Checks of a pose that was not simply followed."""
+
+FOUND_AGAIN: tuple[PoseCheck, ...] = (*PLAUSIBLE, DoesNotFollowMovedThings())
+"""Checks of the place of a camera that was lost for long: meanwhile things may have moved."""
 
 FOUND_NEARBY: tuple[PoseCheck, ...] = (*PLAUSIBLE, DepthColorConsistency())
 """Checks of a pose that was found near the last one."""

@@ -15,13 +15,13 @@ from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.nearby_registration import register_nearby
-from duagc.pipeline.frontend.pose_checks import PLAUSIBLE, verify
+from duagc.pipeline.frontend.pose_checks import FOUND_AGAIN, DoesNotFollowMovedThings, verify
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.align import reach_factor
+from duagc.pipeline.registration.feature_motion import motion_from_features
 from duagc.pipeline.registration.features import Features, matches
-from duagc.pipeline.registration.geometric_verification import motion_from_features
 from duagc.pipeline.registration.place_index import PlaceIndex
 
 
@@ -74,34 +74,39 @@ class Relocalizer:
 
     def __init__(self) -> None:
         self._unconfirmed: _Unconfirmed | None = None
+        self._something_moved = False  # while the camera was lost
         self._index = PlaceIndex()
 
     def __getstate__(self) -> dict[str, object]:
         """Without the index, which follows from the keyframes: a copy makes its own."""
-        return {"_unconfirmed": self._unconfirmed}
+        return {"_unconfirmed": self._unconfirmed, "_something_moved": self._something_moved}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__ |= state | {"_index": PlaceIndex()}
 
     def reset(self) -> None:
-        """Forget the place that waits for confirmation."""
-        self._unconfirmed = None
+        """Forget the place that waits for confirmation, and what moved: the camera was found."""
+        self._unconfirmed, self._something_moved = None, False
 
     def locate(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason:
         """Where a frame is, or why that is not known.
+
+        Where one view shows that something moved, others may show nothing else. Which is the place, a submap decides
+        by all of its views (`submap_joining`).
 
         Args:
             state: what the tracker knows.
             frame: the current frame.
         """
+        if self._something_moved:
+            return Reason.SOMETHING_MOVED
         if self._unconfirmed is not None:
             confirmed = self._confirm(state, frame)
             if confirmed is not None:
                 return confirmed
-        nearby = register_nearby(state, frame)
-        place = nearby if isinstance(nearby, PoseCandidate) else self._find(state, frame)
-        if place is None:
-            return nearby if isinstance(nearby, Reason) else Reason.UNCONFIRMED
+        place = self._find(state, frame)
+        if isinstance(place, Reason):
+            return self._noted(place)
         if state.config.tracking.relocalization.confirmations == 0:
             return place
         self._unconfirmed = _Unconfirmed(place, frame.stamp_ns, 0)
@@ -118,9 +123,18 @@ class Relocalizer:
             self._index.add(keyframe.features.descriptors)
         return self._index.alike(frame.features.descriptors)
 
-    def _find(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | None:
-        """The place of a frame among all keyframes."""
-        return find_place(state, frame, self.alike(state, frame))
+    def _find(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason:
+        """The place of a frame, near the last pose or among all keyframes, or why it is not near the last pose."""
+        nearby = register_nearby(state, frame)
+        if isinstance(nearby, PoseCandidate):
+            return verify([DoesNotFollowMovedThings()], state, frame, nearby)
+        return find_place(state, frame, self.alike(state, frame)) or nearby
+
+    def _noted(self, reason: Reason) -> Reason:
+        """Why a frame has no place; that something moved is remembered."""
+        if reason is Reason.SOMETHING_MOVED:
+            self._something_moved = True
+        return reason
 
     def _confirm(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason | None:
         """Track on from a place that was found; None if the frame does not agree with it."""
@@ -136,11 +150,13 @@ class Relocalizer:
             result = register_until_stable(
                 state.keyframes[index], frame.pyramid, start, tracking, first=tracking.registration
             )
-            found = verify(PLAUSIBLE, state, frame, PoseCandidate(index, result))
+            found = verify(FOUND_AGAIN, state, frame, PoseCandidate(index, result))
             moved_m, _ = se3.distance(last, result.T_reference_target)
             if isinstance(found, PoseCandidate) and moved_m <= reach_m:
                 candidate = found
                 break
+            if found is Reason.SOMETHING_MOVED:
+                return self._noted(found)
         if candidate is None:
             return None
         if before.agreed + 1 >= tracking.relocalization.confirmations:
@@ -160,8 +176,12 @@ def _starts(state: TrackingState, frame: CurrentFrame, keyframe_index: int, last
         yield moved.T_first_second
 
 
-def find_place(state: TrackingState, frame: CurrentFrame, among: Sequence[int]) -> PoseCandidate | None:
-    """The first keyframe, in the order of matching features, that a frame can be registered to; None if there is none.
+def find_place(
+    state: TrackingState, frame: CurrentFrame, among: Sequence[int]
+) -> PoseCandidate | Reason | None:
+    """The first keyframe, in the order of matching features, that a frame can be registered to.
+
+    None if there is none, a reason if something moved between the two.
 
     Args:
         state: what the tracker knows.
@@ -176,9 +196,11 @@ def find_place(state: TrackingState, frame: CurrentFrame, among: Sequence[int]) 
         result = register_until_stable(
             state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
         )
-        found = verify(PLAUSIBLE, state, frame, PoseCandidate(index, result))
+        found = verify(FOUND_AGAIN, state, frame, PoseCandidate(index, result))
         if isinstance(found, PoseCandidate):
             return by_latest_keyframe(state, frame, found)
+        if found is Reason.SOMETHING_MOVED:
+            return found
     return None
 
 
@@ -204,7 +226,7 @@ def by_latest_keyframe(
         if predicted_overlap(keyframe.reference, frame.pyramid, guess) < limits.min_overlap:
             continue
         result = register_until_stable(keyframe, frame.pyramid, guess, tracking, first=tracking.registration)
-        later = verify(PLAUSIBLE, state, frame, PoseCandidate(keyframe.keyframe_index, result))
+        later = verify(FOUND_AGAIN, state, frame, PoseCandidate(keyframe.keyframe_index, result))
         if isinstance(later, PoseCandidate):
             return later
         if (

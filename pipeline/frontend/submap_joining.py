@@ -32,6 +32,7 @@ from duagc.pipeline.posegraph.loop_closures import (
     frame_variance,
     plausible,
 )
+from duagc.pipeline.posegraph.moved_things import TwoMotions, following_moved_things
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePose, RelativePoses
 from duagc.pipeline.posegraph.surface_agreement import surface_agreement
 from duagc.pipeline.registration.features import matches
@@ -73,8 +74,9 @@ def join_submaps(
     links: dict[Ends, _Link] = {}
     for b in range(1, len(submaps)):
         for a in range(b):
-            closures = _closures(submaps[a], submaps[b], images, config=config, seed=seed, robot=robot)
-            link = _link(closures, (submaps[a], submaps[b]), (poses[a], poses[b]), config.submaps)
+            pair, graphs = (submaps[a], submaps[b]), (poses[a], poses[b])
+            closures = _closures(pair, graphs, images, config=config, seed=seed, robot=robot)
+            link = _link(closures, pair, graphs, config.submaps)
             if link.groups:
                 links[a, b] = link
     placement = _placed(links, len(submaps), config.submaps)
@@ -116,6 +118,22 @@ def _keyframe_poses(submap: TrackedSubmap, solved: OptimizedKeyframes, config: S
 
 
 def _closures(
+    submaps: tuple[TrackedSubmap, TrackedSubmap],
+    poses: tuple[KeyframePoses, KeyframePoses],
+    images: Images,
+    *,
+    config: FrontendConfig,
+    seed: int,
+    robot: str,
+) -> list[LoopClosure]:
+    """Verified loop closures from keyframes of one submap to those of another that do not follow what moved."""
+    verified = _verified(*submaps, images, config=config, seed=seed, robot=robot)
+    own, peer = poses
+    moved = following_moved_things(*verified, own=own, peer=peer, config=config.submaps.closures)
+    return [closure for k, closure in enumerate(verified[0]) if k not in moved]
+
+
+def _verified(
     first: TrackedSubmap,
     second: TrackedSubmap,
     images: Images,
@@ -123,10 +141,16 @@ def _closures(
     config: FrontendConfig,
     seed: int,
     robot: str,
-) -> list[LoopClosure]:
-    """Verified loop closures from keyframes of one submap to those of another."""
+) -> tuple[list[LoopClosure], list[LoopClosure], list[TwoMotions]]:
+    """Loop closures from keyframes of one submap to those of another.
+
+    Verified ones, what features alone agree on, and pairs that show two motions.
+    """
     limits, registration = config.submaps, config.tracking.registration
-    levels, found = len(registration.iterations), []
+    levels = len(registration.iterations)
+    closures: list[LoopClosure] = []
+    tentative: list[LoopClosure] = []
+    shown: list[TwoMotions] = []
 
     def view(keyframe: TrackedKeyframe) -> VerificationView:
         return VerificationView(
@@ -138,10 +162,19 @@ def _closures(
         rng = random_streams.generator(
             seed, "frontend.submap", robot=robot, first=one.frame_index, second=other.frame_index
         )
-        verified = verify(view(one), view(other), limits, registration=registration, rng=rng)
-        if verified.failure is None:
-            found.append(LoopClosure(i, j, verified.T_first_second, verified.information))
-    return found
+        verified = verify(view(one), view(other), limits, registration=registration, rng=rng, both=True)
+        place, moved = verified.of_place, verified.of_moved
+        if place.failure is None:
+            closures.append(LoopClosure(i, j, place.T_first_second, place.information))
+        if place.features.T_first_second is None or not place.features.accepted:
+            continue
+        by_features = LoopClosure(i, j, place.features.T_first_second, place.features.information)
+        if moved is not None and moved.failure is None:
+            thing = LoopClosure(i, j, moved.T_first_second, moved.information)
+            shown.append(TwoMotions(by_features, thing))
+        elif place.failure is not None:
+            tentative.append(by_features)
+    return closures, tentative, shown
 
 
 def _resembling(first: TrackedSubmap, second: TrackedSubmap, config: SubmapConfig) -> list[Ends]:

@@ -8,12 +8,10 @@ import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig
-from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.feature_motion import inliers_needed, matched_features
 from duagc.pipeline.registration.features import Features
-from duagc.pipeline.registration.geometric_verification import inliers_needed, matched_features
-from duagc.pipeline.registration.matched_points import ransac
-
-INDEPENDENT_FEATURES = 10  # at most as many of the errors of matched points count as independent
+from duagc.pipeline.registration.matched_points import information_of_fit, ransac
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ def judge_motion(
         return None
     ours, theirs = points[0][agree], points[1][agree]
     given, own = (_median_angle(ours, theirs, T) for T in (T_first_second, T_own))
-    return FeatureJudgment(int(agree.sum()), given, own, T_own, _information(ours, theirs, T_own))
+    return FeatureJudgment(int(agree.sum()), given, own, T_own, information_of_fit(ours, theirs, T_own))
 
 
 def angles_between(points: Array, others: Array) -> Array:
@@ -83,15 +81,3 @@ def _median_angle(points_first: Array, points_second: Array, T_first_second: Arr
         angles_between(points_second, se3.transform(se3.inverse(T_first_second), points_first)),
     ]
     return float(np.median(np.concatenate(angles)))
-
-
-def _information(points_first: Array, points_second: Array, T_first_second: Array) -> Array:
-    """Information [6, 6] of a motion fitted to points: of their distances, and few of them are independent.
-
-    Neighboring features share errors of depth, of calibration and of the shutter.
-    """
-    distance = np.linalg.norm(points_first - se3.transform(T_first_second, points_second), axis=-1)
-    variance = max(float(np.mean(distance**2)) / 3, 1e-6)
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(distance), 3, 3)), -so3.hat(points_second)], axis=-1)
-    H = np.einsum("nka,nkb->ab", J, J) / variance
-    return np.asarray(H * min(1.0, INDEPENDENT_FEATURES / len(distance)))

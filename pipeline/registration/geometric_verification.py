@@ -8,7 +8,7 @@ differ in their settings and in what they have of the two views.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -17,42 +17,16 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
 from duagc.pipeline.geometry import projection, se3
 from duagc.pipeline.registration.align import Registration, reach_factor, register
-from duagc.pipeline.registration.features import Features, matches
-from duagc.pipeline.registration.matched_points import ransac
+from duagc.pipeline.registration.feature_motion import (
+    FeatureMotion,
+    matched_features,
+    motion_of_others,
+    motion_of_points,
+)
+from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.rectified_features import matched_points
 from duagc.pipeline.registration.reference import Reference
-
-APART = 3.0  # of the limits: a match so far from a motion follows another one
-
-
-@dataclass(frozen=True)
-class FeatureMotion:
-    """The motion that matched features of two views agree on.
-
-    Attributes:
-        T_first_second: [4, 4], fitted to the inliers; None with too few matches to try.
-        matches: number of matches.
-        inliers: number of matches that agree.
-        needed: inliers from which the motion is accepted; with too few matches, the matches needed.
-        points: [inliers, 3], meters, where the second view has the matches that agree.
-    """
-
-    T_first_second: Array | None
-    matches: int
-    inliers: int
-    needed: int
-    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
-
-    @property
-    def accepted(self) -> bool:
-        """Whether enough matches agree."""
-        return self.T_first_second is not None and self.inliers >= self.needed
-
-    @property
-    def spread_m(self) -> float:
-        """Root of the mean squared distance of the points that agree from their mean."""
-        return float(np.sqrt(np.sum(np.var(self.points, axis=0)))) if len(self.points) else 0.0
 
 
 class Failure(Enum):
@@ -115,97 +89,15 @@ class GeometricVerification:
     correction_rad: float = 0.0
     another: GeometricVerification | None = None
 
+    @property
+    def of_place(self) -> GeometricVerification:
+        """Of two motions that of the place, which spreads wider: what moves is smaller than what does not."""
+        return self if self.another is None else max(self, self.another, key=lambda m: m.features.spread_m)
 
-def motion_from_features(
-    first: Features, second: Features, config: GeometricVerificationConfig, rng: np.random.Generator
-) -> FeatureMotion:
-    """Match two views' features and find the motion that most matches agree on.
-
-    Args:
-        first: features of the first view.
-        second: features of the second view.
-        config: ratio test, RANSAC, inliers needed.
-        rng: draws the samples of RANSAC.
-    """
-    return _motion_of_points(*matched_features(first, second, config), config, rng)
-
-
-def motion_from_rectified(
-    first: tuple[Features, Features],
-    second: tuple[Features, Features],
-    config: GeometricVerificationConfig,
-    rng: np.random.Generator,
-) -> FeatureMotion:
-    """`motion_from_features` by features of both kinds.
-
-    Args:
-        first: features of the first view, as it is and rectified.
-        second: the same of the second view.
-        config: ratio test, RANSAC, inliers needed.
-        rng: draws the samples of RANSAC.
-    """
-    return _motion_of_points(*matched_points(first, second, config.ratio), config, rng)
-
-
-def matched_features(
-    first: Features, second: Features, config: GeometricVerificationConfig
-) -> tuple[Array, Array]:
-    """Points [n, 3], meters, of matched features of two views, each in its own frame.
-
-    Args:
-        first: features of the first view.
-        second: features of the second view.
-        config: ratio test.
-    """
-    pairs = matches(first.descriptors, second.descriptors, config.ratio)
-    return first.points[pairs[:, 0]].astype(np.float64), second.points[pairs[:, 1]].astype(np.float64)
-
-
-def _motion_of_points(
-    points_first: Array, points_second: Array, config: GeometricVerificationConfig, rng: np.random.Generator
-) -> FeatureMotion:
-    """The motion that most matched points [n, 3] agree on."""
-    n = len(points_first)
-    if n < config.min_inliers:
-        return FeatureMotion(None, n, 0, config.min_inliers)
-    T, agree = ransac(
-        points_first, points_second, inlier_m=config.inlier_m, hypotheses=config.hypotheses, rng=rng
-    )
-    return FeatureMotion(T, n, int(agree.sum()), inliers_needed(n, config), points_second[agree])
-
-
-def _motion_of_others(
-    found: FeatureMotion,
-    points_first: Array,
-    points_second: Array,
-    *,
-    config: GeometricVerificationConfig,
-    rng: np.random.Generator,
-) -> FeatureMotion | None:
-    """The motion of matched points [n, 3] that are far from the one that was found; None if too few agree."""
-    if found.T_first_second is None or not found.accepted:
-        return None
-    apart_m = np.linalg.norm(points_first - se3.transform(found.T_first_second, points_second), axis=-1)
-    others = apart_m > APART * _limit_m(points_first, config)
-    motion = _motion_of_points(points_first[others], points_second[others], config, rng)
-    return replace(motion, matches=len(apart_m)) if motion.accepted else None
-
-
-def features_agree(
-    first: Features, second: Features, T_first_second: Array, config: GeometricVerificationConfig
-) -> bool:
-    """Whether enough matched features of two views meet at a given motion.
-
-    Args:
-        first: features of the first view.
-        second: features of the second view.
-        T_first_second: the motion, [4, 4].
-        config: ratio test, inliers needed.
-    """
-    points_first, points_second = matched_features(first, second, config)
-    moved = se3.transform(T_first_second, points_second)
-    agree = np.linalg.norm(points_first - moved, axis=-1) < _limit_m(points_first, config)
-    return int(agree.sum()) >= inliers_needed(len(agree), config)
+    @property
+    def of_moved(self) -> GeometricVerification | None:
+        """Of two motions that of what moved between the views; None if there is one."""
+        return self.another if self.of_place is self else self
 
 
 def verify(
@@ -240,9 +132,11 @@ def verify(
         points = matched_points(
             (first.features, first.rectified), (second.features, second.rectified), config.ratio
         )
-    found = _motion_of_points(*points, config, rng)
+    found = motion_of_points(*points, config, rng)
     verified = _verified(found, (first, second), config, registration)
-    other = _motion_of_others(found, *points, config=config, rng=rng) if both else None
+    if not both or found.T_first_second is None or not found.accepted:
+        return verified
+    other = motion_of_others(found.T_first_second, *points, config=config, rng=rng)
     if other is None:
         return verified
     return replace(verified, another=_verified(other, (first, second), config, registration))
@@ -341,18 +235,3 @@ def _shares_enough(
     points = se3.transform(T, finest.points.astype(np.float64))
     normals = finest.normals.astype(np.float64) @ T[:3, :3].T
     return projection.covered(points, level.camera, level.inverse_depth, normals) >= config.min_covered
-
-
-def _limit_m(points: Array, config: GeometricVerificationConfig) -> Array:
-    """Distance [n] below which a match of points [n, 3] agrees with a motion."""
-    return np.asarray(config.inlier_m * np.maximum(1.0, points[:, 2]))
-
-
-def inliers_needed(count: int, config: GeometricVerificationConfig) -> int:
-    """Matches that must agree on one motion.
-
-    Args:
-        count: of all matches.
-        config: at least how many, and which share.
-    """
-    return max(config.min_inliers, int(np.ceil(config.min_inlier_share * count)))

@@ -25,6 +25,7 @@ HUBER_SIGMAS = 2.4  # of distances in three dimensions, two of three of which ar
 DEPTH_NOISE = DepthNoise.stated(RegistrationConfig())  # of structured light; its scale is estimated
 LEAST_ANGLE_RAD, LARGEST_ANGLE_RAD = 5e-4, 1e-2  # of a feature: a quarter of a pixel, and some pixels
 LEAST_FACTOR, LARGEST_FACTOR = 0.1, 10.0  # on the noise of depth: exact depth, and poor stereo
+INDEPENDENT_FEATURES = 10  # at most as many of the errors of matched points count as independent
 MEDIAN_OF_SQUARES = 0.455  # of a standard normal number
 
 
@@ -185,3 +186,20 @@ class _Pairs:
         expected = self.depth_a**2 + (self.depth_b * cosine) ** 2
         square = median((along**2 - angle_rad**2 * self.squared_m2) / expected) / MEDIAN_OF_SQUARES
         return float(np.sqrt(np.clip(square, LEAST_FACTOR**2, LARGEST_FACTOR**2)))
+
+
+def information_of_fit(points_a: Array, points_b: Array, T_a_b: Array) -> Array:
+    """Information [6, 6] of a motion fitted to points: of their distances, and few of them are independent.
+
+    Neighboring features share errors of depth, of calibration and of the shutter.
+
+    Args:
+        points_a: [n, 3], camera frame a, meters.
+        points_b: [n, 3], the same points in camera frame b.
+        T_a_b: [4, 4], fitted to them.
+    """
+    distance = np.linalg.norm(points_a - se3.transform(T_a_b, points_b), axis=-1)
+    variance = max(float(np.mean(distance**2)) / 3, 1e-6)
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(distance), 3, 3)), -so3.hat(points_b)], axis=-1)
+    H = np.einsum("nka,nkb->ab", J, J) / variance
+    return np.asarray(H * min(1.0, INDEPENDENT_FEATURES / len(distance)))

@@ -14,6 +14,7 @@ from duagc.pipeline.exchange.place_recognition import Candidate
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.loop_closures import KeyframePoses
+from duagc.pipeline.posegraph.moved_things import TwoMotions
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 from duagc.pipeline.registration.features import matches
 
@@ -29,9 +30,10 @@ def closure(own: int, peer: int, T_ownmap_peermap: np.ndarray) -> LoopClosure:
 
 
 def tried(own: int, peer: int, T: np.ndarray | None, T_moved: np.ndarray | None = None) -> Tried:
-    shown, moved = (None if X is None else closure(own, peer, X) for X in (T, T_moved))
-    verdict = Verdict.FEW_INLIERS if shown is None else Verdict.KEPT
-    return Tried(Candidate(own, peer, 20), Verified(verdict, 40, 20, "", shown, moved=moved))
+    found, moved = (None if X is None else closure(own, peer, X) for X in (T, T_moved))
+    verdict = Verdict.FEW_INLIERS if found is None else Verdict.KEPT
+    shown = None if found is None or moved is None else TwoMotions(found, moved)
+    return Tried(Candidate(own, peer, 20), Verified(verdict, 40, 20, "", found, shown=shown))
 
 
 def verdicts(candidates: list[Tried]) -> list[Verdict]:
@@ -83,4 +85,4 @@ def test_of_two_motions_that_views_show_the_wider_spread_one_is_that_of_the_plac
     assert se3.distance(result.closure.T_own_peer, T_true)[0] < 0.01
     assert result.matches == len(shared)
     assert 50 < result.inliers < 0.5 * len(shared)  # more follow the thing
-    assert result.moved is None  # dense registration does not confirm the thing: images show it where it was
+    assert result.shown is None  # dense registration does not confirm the thing: images show it where it was

@@ -10,13 +10,12 @@ from duagc.pipeline.config.frontend import LoopConfig, RelocalizationConfig
 from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
 from duagc.pipeline.geometry import projection, se3
 from duagc.pipeline.registration import Reference, RgbdPyramid
+from duagc.pipeline.registration.feature_motion import features_agree, motion_from_features
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.geometric_verification import (
     Failure,
     GeometricVerification,
     VerificationView,
-    features_agree,
-    motion_from_features,
     verify,
 )
 from tests.fixtures.room import CAMERA, pose, render
