@@ -269,7 +269,7 @@ def _rules_of_depth(source: RobotLog) -> tuple[float, float]:
     found_m, share = unmeasured([in_meters(image, settings.depth_scale, unit_m) for image in images])
     if found_m:
         source.warnings.append(
-            f"{share:.0%} of {source.depth} is exactly {found_m:.3f} m, far beyond all other: taken for none; "
+            f"{share:.0%} of {source.depth} is exactly {found_m:.3f} m, the greatest: taken for none; "
             "expected 0 where nothing was measured"
         )
     return found_m, unit_m

@@ -177,8 +177,8 @@ def write(
             if greatest:
                 clip = replace(clip, no_depth=(*clip.no_depth, greatest))
                 recording.warnings.append(
-                    f"{name}: {share:.0%} of the depth is exactly {greatest * clip.depth_scale:.3f} m, far beyond all "
-                    "other: taken for none"
+                    f"{name}: {share:.0%} of the depth is exactly {greatest * clip.depth_scale:.3f} m, the greatest: "
+                    "taken for none"
                 )
             with recording.robot(name, clip.camera, clip.depth_scale, sensors) as robot:
                 images = _Images(clip)

@@ -12,6 +12,10 @@ APART = 0.1
 """Relative step below the greatest depth from which no surface leads to it."""
 STEPS_APART = 10
 """Times the usual step between depths of a sensor that counts in coarse ones, likewise."""
+PILED = 10
+"""Times as many pixels as any other of the farther depths has, where surfaces lead up to the greatest."""
+LEAST_CHANGED = 0.5
+"""Of the other depth between the first image and the last: a wall that a standing camera faces has one depth, too."""
 LEAST_SHARE = 0.005
 """Of the known depth of each image that this distance has."""
 SATURATED = 65535
@@ -34,7 +38,12 @@ def unmeasured(images: Sequence[NDArray[Any]]) -> tuple[float, float]:
         images: depth of some images, 0 where it is unknown.
     """
     known = [image[image > 0] for image in images if (image > 0).any()]
-    greatest = greatest_apart(np.concatenate(known)) if known else 0.0
+    if not known:
+        return 0.0, 0.0
+    together = np.concatenate(known)
+    greatest = greatest_apart(together)
+    if not greatest and (piled := greatest_piled(together)):
+        greatest = piled if _others_change(images[0], images[-1], piled) else 0.0
     shares = [float(np.mean(depth == greatest)) for depth in known]
     if not greatest or min(shares) < LEAST_SHARE:
         return 0.0, 0.0
@@ -54,3 +63,23 @@ def greatest_apart(depth: NDArray[Any]) -> float:
     upper = values[:-2] >= values[-2] / 2
     usual = float(np.median(steps[:-1][upper])) if upper.any() else APART
     return float(values[-1]) if steps[-1] > max(APART, STEPS_APART * usual) else 0.0
+
+
+def greatest_piled(depth: NDArray[Any]) -> float:
+    """The greatest depth, if far more pixels have it than have any other in the farther half of the range; else 0.
+
+    What is beyond the range of a sensor may be given its end: surfaces lead up to it, but none lies at one number of a
+    sensor in the images of a camera that moves.
+
+    Args:
+        depth: known depths of some images together, positive.
+    """
+    values, counts = np.unique(depth, return_counts=True)
+    others = counts[:-1][values[:-1] >= values[-1] / 2]
+    return float(values[-1]) if len(others) > 1 and counts[-1] > PILED * others.max() else 0.0
+
+
+def _others_change(first: NDArray[Any], last: NDArray[Any], greatest: float) -> bool:
+    """Whether most of the depth of two images that is not the greatest changes between them."""
+    both = (first > 0) & (last > 0) & (first != greatest) & (last != greatest)
+    return bool(both.any()) and float(np.mean(first[both] != last[both])) > LEAST_CHANGED
