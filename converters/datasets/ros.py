@@ -303,6 +303,10 @@ def _measured(
         values = np.where(meters < farthest_m, values, values.dtype.type(0))
     if source.depth_maps is not None:
         values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
+    if source.settings.depth_along == "ray":
+        seen_by = source.camera if source.T_color_depth is None else source.depth_camera.camera
+        along_z = values / seen_by.ray_lengths()
+        values = along_z if values.dtype.kind == "f" else np.rint(along_z).astype(values.dtype)
     if source.keeps_depth and values.dtype == np.uint16:
         return Picture(data, color_format, np.asarray(values, dtype=np.uint16)), 0
     meters = in_meters(values, source.settings.depth_scale, float_unit)

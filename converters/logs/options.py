@@ -61,6 +61,8 @@ class LogOptions(AssociationOptions, StereoOptions):
     """Pose of the color camera in the body that the true poses are of, likewise."""
     depth_scale: float = Field(default=0.001, gt=0)
     """Meters per unit of 16-bit depth."""
+    depth_along: Literal["z", "ray"] = "z"
+    """What depth images state: depth along z, or the distance from the camera along the ray of each pixel."""
     farthest_m: float = Field(default=0.0, ge=0.0)
     """Depth from here on is none; 0: found where a camera gives its greatest distance for what it does not measure."""
     range_sigma_m: float = Field(default=0.03, gt=0)

@@ -149,7 +149,7 @@ def _check_robot(
     add(images.check_sight(robot, sight, config.images))
     moved: list[geometry.Move] = []
     if sight.known:
-        moved = geometry.moves(log, config.motion)
+        moved = geometry.moves(log, config.motion, as_range=True)
         add(geometry.check_moves(robot, moved, config.motion))
         sensors = " ".join(f"{key} {value}" for key, value in log_metadata(log.path).items())
         add(geometry.check_range(robot, sight, moved, sensors, config=config.motion))

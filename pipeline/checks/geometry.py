@@ -24,6 +24,7 @@ Image = NDArray[np.float32]
 
 MEASURED_AFAR = ("stereo", "lidar", "render", "simulat")  # words about a sensor that may see farther
 WEAK_SHARE = 0.1  # of a direction of motion that the images do not determine
+LESS = 0.99  # of another residual: less by more than rounding
 
 
 def check_camera(robot: str, camera: PinholeCamera, config: CameraChecks) -> Iterator[Finding]:
@@ -73,6 +74,7 @@ class Move:
         depth_m: median depth of the first frame.
         depth_rms_m: weighted depth residual of the registration.
         depth_offset_ns: the larger of the two times between color and depth.
+        residual_as_range: as `residual`, if depth were the distance along the ray; NaN if that does not register.
     """
 
     first_ns: int
@@ -84,6 +86,7 @@ class Move:
     depth_m: float = 0.0
     depth_rms_m: float = 0.0
     depth_offset_ns: int = 0
+    residual_as_range: float = np.nan
 
     @property
     def speed_m_s(self) -> float:
@@ -93,8 +96,14 @@ class Move:
         return float(np.linalg.norm(self.T_first_second[:3, 3]) / ((self.second_ns - self.first_ns) * 1e-9))
 
 
-def moves(log: RgbdLog, config: MotionChecks) -> list[Move]:
-    """Pairs of frames spread over the log, each registered and the depth of one moved into the other."""
+def moves(log: RgbdLog, config: MotionChecks, *, as_range: bool = False) -> list[Move]:
+    """Pairs of frames spread over the log, each registered and the depth of one moved into the other.
+
+    Args:
+        log: of a robot.
+        config: how many pairs, and how far apart.
+        as_range: register each once more as if depth were the distance along the ray.
+    """
     frames = _with_depth_of_their_own(log)
     stamps = np.array([log.pairing.pairs[index][0] for index in frames], dtype=np.int64)
     found = []
@@ -103,7 +112,7 @@ def moves(log: RgbdLog, config: MotionChecks) -> list[Move]:
         near = int(np.searchsorted(stamps, stamps[first] + round(1e9 * config.pair_s), side="right")) - 1
         frame = log.frame(frames[first])
         for second in sorted({max(near, first + 1), first + 1}, reverse=True):
-            move = _move(frame, log.frame(frames[second]), log.camera)
+            move = _move(frame, log.frame(frames[second]), log.camera, as_range=as_range)
             if move.T_first_second is not None:
                 break
         found.append(move)
@@ -120,32 +129,49 @@ def _with_depth_of_their_own(log: RgbdLog) -> list[int]:
     return sorted(index for _, index in nearest.values())
 
 
-def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> Move:
-    a, b = (
-        RgbdPyramid.build(
-            frame.color.astype(np.float32) / 255,
-            frame.usable_depth,
-            camera,
-            depth_sigma_m=frame.depth_sigma,
-            mask=frame.mask,
-        )
-        for frame in (first, second)
-    )
-    result = register(Reference.from_pyramid(a), b, np.eye(4))
+def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera, *, as_range: bool) -> Move:
+    depths = first.usable_depth, second.usable_depth
+    result = _registered(first, second, depths, camera)
     if not result.ok:
         return Move(first.stamp_ns, second.stamp_ns, None)
-    T, depth_m = result.T_reference_target, first.usable_depth
+    T, depth_m = result.T_reference_target, depths[0]
     return Move(
         first.stamp_ns,
         second.stamp_ns,
         T,
-        residual=_moved(depth_m, second.usable_depth, T, camera),
+        residual=_moved(*depths, T, camera),
         sigma_m=_length_sigma_m(result),
         turned_rad=float(se3.distance(np.eye(4), T)[1]),
         depth_m=float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0,
         depth_rms_m=result.rms_depth_m,
         depth_offset_ns=max(abs(first.depth_offset_ns), abs(second.depth_offset_ns)),
+        residual_as_range=_residual_as_range(first, second, camera) if as_range else np.nan,
     )
+
+
+def _residual_as_range(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> float:
+    """`Move.residual` if depth were the distance along the ray; NaN if that does not register."""
+    lengths = camera.ray_lengths().astype(np.float32)
+    along_z = first.usable_depth / lengths, second.usable_depth / lengths
+    result = _registered(first, second, along_z, camera)
+    return _moved(*along_z, result.T_reference_target, camera) if result.ok else np.nan
+
+
+def _registered(
+    first: RgbdFrame, second: RgbdFrame, depths: tuple[Image, Image], camera: PinholeCamera
+) -> Registration:
+    """The registration of two frames with some depth [h, w] of both, meters along z."""
+    a, b = (
+        RgbdPyramid.build(
+            frame.color.astype(np.float32) / 255,
+            depth_m,
+            camera,
+            depth_sigma_m=frame.depth_sigma,
+            mask=frame.mask,
+        )
+        for frame, depth_m in zip((first, second), depths, strict=True)
+    )
+    return register(Reference.from_pyramid(a), b, np.eye(4))
 
 
 def _length_sigma_m(result: Registration) -> float:
@@ -196,6 +222,18 @@ def check_moves(robot: str, found: list[Move], config: MotionChecks) -> Iterator
             f"{config.min_registered:.0%} or more",
             "tracking will be lost; see whether color and depth are of one time and place, and the rate is enough",
             confidence=share_above(len(found) - len(registered), len(found), 1 - config.min_registered),
+        )
+    both = [m for m in registered if np.isfinite(m.residual) and np.isfinite(m.residual_as_range)]
+    if both:
+        z, ray = np.median([(m.residual, m.residual_as_range) for m in both], axis=0)
+        yield Finding(
+            Severity.WARNING,
+            "depth along z",
+            robot,
+            f"depth moved into a later frame differs by {z:.2%}, and by {ray:.2%} if it is a distance along the ray",
+            "depth along z",
+            "convert the log with --set depth_along=ray, or divide depth by the length of the ray of its pixel",
+            confidence=share_above(sum(m.residual_as_range < LESS * m.residual for m in both), len(both)),
         )
     residuals = np.array([move.residual for move in registered if np.isfinite(move.residual)])
     if len(residuals) and np.median(residuals) > config.max_residual:

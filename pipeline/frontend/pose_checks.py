@@ -223,7 +223,7 @@ class DoesNotFollowMovedThings:
         # the draws only choose which samples are tried: the same in every run
         rng = random_streams.generator(0, "moved_things", frame=frame.frame_index, keyframe=k)
         features, T = state.keyframes[k].features, candidate.result.T_reference_target
-        moved = follows_something_moved(features, frame.features, T, limits, rng)
+        moved = follows_something_moved(features, frame.features, T, config=limits, rng=rng)
         return Reason.SOMETHING_MOVED if moved else candidate
 
 

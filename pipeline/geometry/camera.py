@@ -77,6 +77,10 @@ class PinholeCamera:
         x, y = (np.asarray(u) - self.cx) / self.fx, (np.asarray(v) - self.cy) / self.fy
         return np.stack([x, y, np.ones(np.shape(x))], axis=-1)
 
+    def ray_lengths(self) -> NDArray[np.float64]:
+        """Length of the ray of every pixel with z = 1, [height, width]: distances divided by it are depths along z."""
+        return np.linalg.norm(self.rays(), axis=-1)
+
     def project(self, points_camera: ArrayLike) -> NDArray[np.float64]:
         """Pixels [..., 2] of points.
 

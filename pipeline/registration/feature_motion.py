@@ -145,6 +145,7 @@ def follows_something_moved(
     first: Features,
     second: Features,
     T_first_second: Array,
+    *,
     config: GeometricVerificationConfig,
     rng: np.random.Generator,
 ) -> bool:

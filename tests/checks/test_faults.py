@@ -90,6 +90,16 @@ def unregistered(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
         yield record, message, publish_ns
 
 
+def along_the_ray(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Depth is the distance from the camera."""
+    (camera,) = [m.unpack_calibration(record.proto()) for record in records if record.topic == CALIBRATION]
+    for record, message, publish_ns in nothing(records):
+        if record.topic == DEPTH:
+            units = np.rint(m.unpack_depth(message, "") * camera.ray_lengths())
+            message = m.pack_depth(publish_ns, "bravo", units.astype(np.uint16))
+        yield record, message, publish_ns
+
+
 def blue(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
     """Red and blue exchanged."""
     for record, message, publish_ns in nothing(records):
@@ -194,6 +204,7 @@ FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
     "scale x5, no truth": (nothing, {"scale": 5, "truth": False}, "warning", "depth scale"),
     "late depth": (late_depth, {}, "warning", "depth in time"),
     "unregistered depth": (unregistered, {}, "warning", "depth in place"),
+    "depth along the ray": (along_the_ray, {"truth": False}, "warning", "depth along z"),
     "red and blue": (blue, {"alone": False}, "warning", "color order"),
     "center swapped": (swapped(cx="cy", cy="cx"), {}, "warning", "intrinsics"),
     "size for focal length": (swapped(fx="height"), {}, "warning", "intrinsics"),

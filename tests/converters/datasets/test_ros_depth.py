@@ -169,6 +169,31 @@ def test_the_greatest_distance_is_no_measurement(tmp_path: Path, options: list[s
     assert any("is exactly 20.000 m" in text for text in warnings) == (not options)
 
 
+@pytest.mark.parametrize("kind", ["16UC1", "32FC1"])
+def test_distances_along_the_ray_become_depth_along_z(tmp_path: Path, kind: str) -> None:
+    """As if the camera had stated depth, to a unit; they are moved to the color camera like that."""
+    r = Ros(2)
+    found = []
+    for along in ("z", "ray"):
+        rows = []
+        for topic, log_ns, message in scene(r):
+            if "/depth/image" in topic:
+                meters = render(DEPTH, path(FRAMES)[0])[1] * (DEPTH.ray_lengths() if along == "ray" else 1)
+                units = np.rint(1000 * meters).astype(np.uint16)
+                message = r.image(
+                    log_ns, "_depth", units if kind == "16UC1" else meters.astype(np.float32), kind
+                )
+            rows.append((topic, log_ns, message))
+        bag = r.write(tmp_path / along, rows, "mcap")
+        registry.convert("ros", bag, tmp_path / f"{along}_rec", options=[f"depth_along={along}"])
+        with open_rgbd(tmp_path / f"{along}_rec" / "alpha.mcap") as log:
+            found.append(log.frame(0).depth)
+    both = (found[0] > 0) & (found[1] > 0)
+    assert both.mean() > 0.9 * (found[0] > 0).mean() > 0.3
+    assert np.median(np.abs(found[0] - found[1])[both]) < 0.002
+    assert np.percentile(np.abs(found[0] - found[1])[both], 95) < 0.01
+
+
 def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
     """To the last bit, in any unit, and beyond 32 m; only the largest number is none."""
     r = Ros(2)
