@@ -66,10 +66,16 @@ def _settle(replaced: Path, out: Path) -> None:
     """Remove what was replaced; where the process was stopped before the new folder had its name, put it back."""
     if not replaced.exists():
         return
-    if out.exists():
-        shutil.rmtree(replaced)
-    else:
+    if not out.exists():
         replaced.rename(out)
+        return
+    try:
+        shutil.rmtree(replaced)
+    except OSError as error:
+        reason = error.strerror or error
+        raise DuagError(
+            f"{replaced}: {reason}, expected to remove what was replaced; {out} is whole"
+        ) from error
 
 
 @contextmanager

@@ -48,6 +48,23 @@ def test_what_is_stopped_while_it_removes_the_old_one_leaves_the_new_one(tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+def test_what_cannot_be_removed_is_named_and_the_new_one_is_there(tmp_path, monkeypatch) -> None:
+    """A folder without the permission to write: the error of the system names only a file in it."""
+    write(tmp_path / "run", "old")
+
+    remove = shutil.rmtree
+
+    def refuse(folder, **how):
+        if str(folder).endswith(".replaced.part"):
+            raise PermissionError(13, "Permission denied", "fused.mcap")
+        remove(folder, **how)
+
+    monkeypatch.setattr(atomic_folder.shutil, "rmtree", refuse)
+    with pytest.raises(DuagError, match=r"run\.replaced\.part: Permission denied.*run is whole"):
+        write(tmp_path / "run", "new")
+    assert content(tmp_path / "run") == {"manifest.json": "new", "fused.mcap": "new"}
+
+
 def test_what_is_stopped_between_two_names_gives_the_old_one_back(tmp_path: Path) -> None:
     write(tmp_path / "run", "old")
     (tmp_path / "run").rename(tmp_path / "run.replaced.part")
