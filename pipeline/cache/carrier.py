@@ -232,14 +232,12 @@ class Carrier:
     def _keep(self, entry: StoredResults) -> bool:
         """Keep results, if the store has room for them; the run goes on anyway."""
         assert self.store is not None
-        if entry.key.stage in self.again and (stored := self.store.find(entry.key)) is not None:
-            names = sorted({*stored.files, *entry.files})
-            other = [n for n in names if _content(stored, n) != _content(entry, n)]
-            if other:
-                self.say(
-                    f"warning: {words(entry.key)}: {other[0]} has digest {_content(entry, other[0])[:12]}, "
-                    f"expected {_content(stored, other[0])[:12]} as computed before from the same"
-                )
+        before = self.store.find(entry.key) if entry.key.stage in self.again else None
+        if before is not None and (other := differing(before, entry)):
+            self.say(
+                f"warning: {words(entry.key)}: {other[0]} has digest {_content(entry, other[0])[:12]}, "
+                f"expected {_content(before, other[0])[:12]} as computed before from the same"
+            )
         try:
             self.store.keep(entry, self.folder)
         except OSError as error:
@@ -264,6 +262,17 @@ def intact(folder: Path, entry: StoredResults, digests: FileDigests) -> str:
             return name
         digests.keep(path, digest)
     return ""
+
+
+def differing(first: StoredResults, second: StoredResults) -> list[str]:
+    """Names of the files that two computations of the same made otherwise, sorted.
+
+    Args:
+        first: results of one.
+        second: of the other; views do not count, for Rerun gives their chunks random numbers.
+    """
+    names = sorted(name for name in {*first.files, *second.files} if not name.endswith(".rrd"))
+    return [name for name in names if _content(first, name) != _content(second, name)]
 
 
 def _content(entry: StoredResults, name: str) -> str:

@@ -13,7 +13,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cache import claims
-from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError
+from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError, differing
 from duagc.pipeline.cache.code_identity import CodeReader
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.garbage import LEFTOVER_NS, collect
@@ -193,6 +193,16 @@ def test_other_bytes_from_the_same_are_reported(bench: Bench) -> None:
     (line,) = bench.said
     assert "warning: sum: sum.txt has digest" in line
     assert "as computed before from the same" in line
+
+
+def test_views_of_the_same_have_other_bytes(bench: Bench) -> None:
+    """Rerun gives chunks random numbers."""
+    (sound,) = bench.carry().entry.files.values()
+    first = replace(bench.carry().entry, files={"run.rrd": sound, "sum.txt": sound})
+    second = replace(first, files=dict.fromkeys(first.files, replace(sound, content="else")))
+    assert differing(first, second) == ["sum.txt"]
+    assert differing(first, replace(first, files={"run.rrd": sound})) == ["sum.txt"]
+    assert differing(first, first) == []
 
 
 def test_a_store_that_cannot_be_written_stops_no_run(bench: Bench) -> None:
