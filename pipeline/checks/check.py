@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.checks import estimate, geometry, gyroscope, images, measured, scale, stamps
+from duagc.pipeline.checks import estimate, geometry, gyroscope, images, measured, moves, scale, stamps
 from duagc.pipeline.checks.findings import Finding, Report, Severity, judged, lines
 from duagc.pipeline.checks.keyframe_count import count_keyframes
 from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
@@ -109,11 +109,11 @@ def expected_size(log: Path, config: FrontendConfig, checks: ChecksConfig = _DEF
         DuagError: the log is damaged.
     """
     with open_rgbd(log) as rgbd:
-        moved = geometry.moves(rgbd, checks.motion)
+        moved = moves.moves(rgbd, checks.motion)
         keyframes = count_keyframes(rgbd, checks.keyframes, config.keyframes)
     return {
         "keyframes": keyframes.expected,
-        "exact": int(geometry.has_exact_depth(moved, config.mapping)),
+        "exact": int(moves.has_exact_depth(moved, config.mapping)),
     }
 
 
@@ -147,9 +147,9 @@ def _check_robot(
     sight = sights[robot] = images.Sight.of((log.frame(i) for i in shown), log.depth_scale, len(log))
     add(images.check_light(robot, sight, FailureConfig().max_saturated))
     add(images.check_sight(robot, sight, config.images))
-    moved: list[geometry.Move] = []
+    moved: list[moves.Move] = []
     if sight.known:
-        moved = geometry.moves(log, config.motion, as_range=True)
+        moved = moves.moves(log, config.motion, as_range=True)
         add(geometry.check_moves(robot, moved, config.motion))
         sensors = " ".join(f"{key} {value}" for key, value in log_metadata(log.path).items())
         add(geometry.check_range(robot, sight, moved, sensors, config=config.motion))
@@ -163,7 +163,7 @@ def _check_robot(
         "frames": len(log),
         "pixels": log.camera.width * log.camera.height,
         "moved": int(log.needs_motion),
-        "exact": int(geometry.has_exact_depth(moved, MappingConfig())),
+        "exact": int(moves.has_exact_depth(moved, MappingConfig())),
         "depth_m": [round(value, 4) for value in sight.depth_m] if sight.known else None,
         "with_depth": round(sight.known, 4),
         "registered_pairs": f"{sum(move.T_first_second is not None for move in moved)} of {len(moved)}",
@@ -205,7 +205,7 @@ def _check_clock(recording: Recording, robot: str) -> Iterator[Finding]:
 def _check_scales(
     recording: Recording | None,
     log: RgbdLog,
-    moved: list[geometry.Move],
+    moved: list[moves.Move],
     prior: MotionPrior | None,
     *,
     config: MotionChecks,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,18 +12,14 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.checks.confidence import share_above
 from duagc.pipeline.checks.findings import Finding, Severity
 from duagc.pipeline.checks.images import FEW_FRAMES, Sight
+from duagc.pipeline.checks.moves import Move
 from duagc.pipeline.config.checks import CameraChecks, EdgeChecks, MotionChecks
-from duagc.pipeline.config.mapping import MappingConfig
-from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.projection import visible
-from duagc.pipeline.recording import RgbdFrame, RgbdLog
-from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
+from duagc.pipeline.recording import RgbdLog
 
 Image = NDArray[np.float32]
 
 MEASURED_AFAR = ("stereo", "lidar", "render", "simulat")  # words about a sensor that may see farther
-WEAK_SHARE = 0.1  # of a direction of motion that the images do not determine
 LESS = 0.99  # of another residual: less by more than rounding
 
 
@@ -58,156 +54,6 @@ def check_camera(robot: str, camera: PinholeCamera, config: CameraChecks) -> Ite
             f"{config.views_deg[0]:g} to {config.views_deg[1]:g} degrees",
             "see whether the calibration is of another resolution",
         )
-
-
-@dataclass(frozen=True)
-class Move:
-    """A pair of frames.
-
-    Attributes:
-        first_ns: time of the first frame.
-        second_ns: time of the second frame.
-        T_first_second: [4, 4], by registration; None if that failed.
-        residual: median difference of depth moved into the other frame, relative.
-        sigma_m: standard deviation of the length of the translation, by the covariance of the registration.
-        turned_rad: angle of the rotation.
-        depth_m: median depth of the first frame.
-        depth_rms_m: weighted depth residual of the registration.
-        depth_offset_ns: the larger of the two times between color and depth.
-        residual_as_range: as `residual`, if depth were the distance along the ray; NaN if that does not register.
-    """
-
-    first_ns: int
-    second_ns: int
-    T_first_second: Array | None
-    residual: float = np.nan
-    sigma_m: float = 0.0
-    turned_rad: float = 0.0
-    depth_m: float = 0.0
-    depth_rms_m: float = 0.0
-    depth_offset_ns: int = 0
-    residual_as_range: float = np.nan
-
-    @property
-    def speed_m_s(self) -> float:
-        """Of the translation; NaN if the registration failed."""
-        if self.T_first_second is None:
-            return np.nan
-        return float(np.linalg.norm(self.T_first_second[:3, 3]) / ((self.second_ns - self.first_ns) * 1e-9))
-
-
-def moves(log: RgbdLog, config: MotionChecks, *, as_range: bool = False) -> list[Move]:
-    """Pairs of frames spread over the log, each registered and the depth of one moved into the other.
-
-    Args:
-        log: of a robot.
-        config: how many pairs, and how far apart.
-        as_range: register each once more as if depth were the distance along the ray.
-    """
-    frames = _with_depth_of_their_own(log)
-    stamps = np.array([log.pairing.pairs[index][0] for index in frames], dtype=np.int64)
-    found = []
-    last = len(stamps) - 1
-    for first in np.unique(np.linspace(0, last - 1, min(config.pairs, last)).astype(int)).tolist():
-        near = int(np.searchsorted(stamps, stamps[first] + round(1e9 * config.pair_s), side="right")) - 1
-        frame = log.frame(frames[first])
-        for second in sorted({max(near, first + 1), first + 1}, reverse=True):
-            move = _move(frame, log.frame(frames[second]), log.camera, as_range=as_range)
-            if move.T_first_second is not None:
-                break
-        found.append(move)
-    return found
-
-
-def _with_depth_of_their_own(log: RgbdLog) -> list[int]:
-    """Indices of frames, of those that share a depth image the nearest to it in time: of one image nothing moves."""
-    nearest: dict[int, tuple[int, int]] = {}
-    for index, (color_ns, depth_ns) in enumerate(log.pairing.pairs):
-        if depth_ns is not None:
-            here = abs(depth_ns - color_ns), index
-            nearest[depth_ns] = min(nearest.get(depth_ns, here), here)
-    return sorted(index for _, index in nearest.values())
-
-
-def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera, *, as_range: bool) -> Move:
-    depths = first.usable_depth, second.usable_depth
-    result = _registered(first, second, depths, camera)
-    if not result.ok:
-        return Move(first.stamp_ns, second.stamp_ns, None)
-    T, depth_m = result.T_reference_target, depths[0]
-    return Move(
-        first.stamp_ns,
-        second.stamp_ns,
-        T,
-        residual=_moved(*depths, T, camera),
-        sigma_m=_length_sigma_m(result),
-        turned_rad=float(se3.distance(np.eye(4), T)[1]),
-        depth_m=float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0,
-        depth_rms_m=result.rms_depth_m,
-        depth_offset_ns=max(abs(first.depth_offset_ns), abs(second.depth_offset_ns)),
-        residual_as_range=_residual_as_range(first, second, camera) if as_range else np.nan,
-    )
-
-
-def _residual_as_range(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> float:
-    """`Move.residual` if depth were the distance along the ray; NaN if that does not register."""
-    lengths = camera.ray_lengths().astype(np.float32)
-    along_z = first.usable_depth / lengths, second.usable_depth / lengths
-    result = _registered(first, second, along_z, camera)
-    return _moved(*along_z, result.T_reference_target, camera) if result.ok else np.nan
-
-
-def _registered(
-    first: RgbdFrame, second: RgbdFrame, depths: tuple[Image, Image], camera: PinholeCamera
-) -> Registration:
-    """The registration of two frames with some depth [h, w] of both, meters along z."""
-    a, b = (
-        RgbdPyramid.build(
-            frame.color.astype(np.float32) / 255,
-            depth_m,
-            camera,
-            depth_sigma_m=frame.depth_sigma,
-            mask=frame.mask,
-        )
-        for frame, depth_m in zip((first, second), depths, strict=True)
-    )
-    return register(Reference.from_pyramid(a), b, np.eye(4))
-
-
-def _length_sigma_m(result: Registration) -> float:
-    """Standard deviation of the length of a translation; infinite where a direction of it was not measured."""
-    along = np.zeros(6)
-    along[:3] = result.T_reference_target[:3, :3].T @ result.T_reference_target[:3, 3]
-    along /= max(float(np.linalg.norm(along)), 1e-12)
-    if len(result.weak) and np.abs(result.weak @ along).max() > WEAK_SHARE:
-        return float("inf")
-    variance = float(along @ np.linalg.pinv(result.information) @ along)
-    return float(np.sqrt(max(variance, 0.0)))
-
-
-def _moved(first_m: Image, second_m: Image, T_first_second: Array, camera: PinholeCamera) -> float:
-    """Median relative difference of depth moved into the second frame; NaN if it shows nothing of the first."""
-    points = camera.back_project(first_m)[::4, ::4].reshape(-1, 3)
-    points = points[points[:, 2] > 0]
-    moved = se3.transform(se3.inverse(T_first_second), points)
-    index, u, v = visible(camera, moved, near_m=0.0)
-    expected, found = moved[index, 2], second_m[v, u]
-    both = found > 0
-    return float(np.median(np.abs(found - expected)[both] / expected[both])) if both.any() else np.nan
-
-
-def has_exact_depth(found: Sequence[Move], config: MappingConfig) -> bool:
-    """Whether maps will be made for exact depth, as far as some pairs of frames tell.
-
-    Args:
-        found: the pairs.
-        config: of the maps.
-    """
-    measured = [move for move in found if move.T_first_second is not None and move.depth_rms_m > 0]
-    if not measured:
-        return config.depth_kind(None) == "ray_plane"
-    noise_m, depth_m = np.median([(move.depth_rms_m, move.depth_m) for move in measured], axis=0).tolist()
-    return config.depth_kind(noise_m, depth_m) == "ray_plane"
 
 
 def check_moves(robot: str, found: list[Move], config: MotionChecks) -> Iterator[Finding]:

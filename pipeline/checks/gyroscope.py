@@ -8,7 +8,7 @@ import numpy as np
 
 from duagc.pipeline.checks.confidence import share_above
 from duagc.pipeline.checks.findings import Finding, Severity
-from duagc.pipeline.checks.geometry import Move
+from duagc.pipeline.checks.moves import Move
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.recording import MotionPrior
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from duagc.pipeline.checks.confidence import above
 from duagc.pipeline.checks.findings import Finding, Severity
-from duagc.pipeline.checks.geometry import Move
+from duagc.pipeline.checks.moves import Move
 from duagc.pipeline.config.checks import MotionChecks
 from duagc.pipeline.geometry.statistics import mad_sigma
 

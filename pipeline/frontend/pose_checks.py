@@ -219,10 +219,11 @@ class DoesNotFollowMovedThings:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
-        k, limits = candidate.keyframe_index, state.config.tracking.relocalization
-        # the draws only choose which samples are tried: the same in every run
-        rng = random_streams.generator(0, "moved_things", frame=frame.frame_index, keyframe=k)
-        features, T = state.keyframes[k].features, candidate.result.T_reference_target
+        limits, features = (
+            state.config.tracking.relocalization,
+            state.keyframes[candidate.keyframe_index].features,
+        )
+        T, rng = candidate.result.T_reference_target, _draws("moved_things", frame, candidate)
         moved = follows_something_moved(features, frame.features, T, config=limits, rng=rng)
         return Reason.SOMETHING_MOVED if moved else candidate
 
@@ -236,10 +237,8 @@ class FeaturesDoNotContradict:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
-        k, limits = candidate.keyframe_index, state.config.keyframes.judgment
-        # the draws only choose which samples are tried: the same in every run
-        rng = random_streams.generator(0, "frame_judgment", frame=frame.frame_index, keyframe=k)
-        features, T = state.keyframes[k].features, candidate.result.T_reference_target
+        limits, features = state.config.keyframes.judgment, state.keyframes[candidate.keyframe_index].features
+        T, rng = candidate.result.T_reference_target, _draws("frame_judgment", frame, candidate)
         found = judge_motion(features, frame.features, T, config=limits, rng=rng)
         return Reason.OBSTRUCTED if found is not None and contradicts(found, limits) else candidate
 
@@ -257,6 +256,11 @@ class FeaturesAllowWorseLook:
         if candidate.without is not Reason.NONE or not state.looks_worse_than_usual(candidate.result):
             return candidate
         return FeaturesDoNotContradict().judge(state, frame, candidate)
+
+
+def _draws(stream: str, frame: CurrentFrame, candidate: PoseCandidate) -> np.random.Generator:
+    """Draws that only choose which samples are tried: the same in every run."""
+    return random_streams.generator(0, stream, frame=frame.frame_index, keyframe=candidate.keyframe_index)
 
 
 def _features_prefer(T: Array, T_other: Array, keyframe: TrackedKeyframe, frame: CurrentFrame) -> bool:

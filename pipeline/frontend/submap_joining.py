@@ -127,10 +127,12 @@ def _closures(
     robot: str,
 ) -> list[LoopClosure]:
     """Verified loop closures from keyframes of one submap to those of another that do not follow what moved."""
-    verified = _verified(*submaps, images, config=config, seed=seed, robot=robot)
+    verified, tentative, shown = _verified(*submaps, images, config=config, seed=seed, robot=robot)
     own, peer = poses
-    moved = following_moved_things(*verified, own=own, peer=peer, config=config.submaps.closures)
-    return [closure for k, closure in enumerate(verified[0]) if k not in moved]
+    moved = following_moved_things(
+        verified, tentative, shown, own=own, peer=peer, config=config.submaps.closures
+    )
+    return [closure for k, closure in enumerate(verified) if k not in moved]
 
 
 def _verified(

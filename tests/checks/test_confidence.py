@@ -13,7 +13,7 @@ from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.checks import check, confidence, scale
 from duagc.pipeline.checks.findings import Finding, Severity, judged
-from duagc.pipeline.checks.geometry import Move
+from duagc.pipeline.checks.moves import Move
 from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
 from duagc.pipeline.geometry import se3
 from tests.fixtures.mesh_scenes import folder_of, some_poses

@@ -220,10 +220,7 @@ FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
 }
 
 
-REPEATED = (
-    "scale x0.2",
-    "size for focal length",
-)  # of a finding that another fault stands for in `make test`
+REPEATED = "scale x0.2", "size for focal length"  # of a finding that another fault stands for in `make test`
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from duagc.pipeline.checks.geometry import Move
 from duagc.pipeline.checks.gyroscope import check_gyroscope
+from duagc.pipeline.checks.moves import Move
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.recording import Motion
 
