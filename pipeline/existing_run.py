@@ -65,7 +65,19 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
         if name:
             log(f"{out / name}: is not what was computed; taken from the store")
             return False
-    return True
+    return plan.until == LAST or len(_that_hold(recording, out, config, plan, place=out)) == len(earlier)
+
+
+def _that_hold(
+    recording: Recording, folder: Path, config: RunConfig, plan: RunPlan, *, place: Path
+) -> list[Carried]:
+    """Stages of the run in a place, also those after the plan's, whose keys are what they would be now."""
+    earlier = stages_of(place)
+    every = replace(plan, since=None, until=LAST, evaluated=stages.EVALUATION.name in earlier)
+    job = Job(recording, folder, config, every, log=lambda line: None, place=place, looking=True)
+    job.carrier.earlier = earlier | stages_of(folder)  # a report shows what the stages of its own run took
+    done, _ = job.look()
+    return [carried for carried in done if _key(earlier, carried.label) == carried.entry.key.digest]
 
 
 def follow_recording(recording: Recording, out: Path) -> None:
@@ -118,12 +130,16 @@ def keep_what_holds(
         config: settings of all stages.
         plan: how it was done; with a store.
         out: folder of the earlier run.
-        log: gets a line if results are left out.
+        log: gets a line if results are left out, or replaced though `duagc evaluate` wrote them.
     """
     earlier, made = stages_of(out), stages_of(folder)
-    looked_for = replace(plan, since=None, until=LAST, evaluated=stages.EVALUATION.name in earlier)
-    done, _ = Job(recording, folder, config, looked_for, log=log, place=out, looking=True).look()
-    hold = [carried for carried in done if _key(earlier, carried.label) == carried.entry.key.digest]
+    hold = _that_hold(recording, folder, config, plan, place=out)
+    if stages.EVALUATION.name in made and plan.store is not None:
+        name = measured_otherwise(out, plan.store)
+        if name in made[stages.EVALUATION.name]["files"] and (out / name).is_file():
+            log(
+                f"warning: {out / name}: was written by another evaluation since; replaced by that of this run"
+            )
     left_out = _results(out, earlier) - {name for carried in hold for name in carried.entry.files}
     lost = []
     for path in sorted(out.rglob("*")):

@@ -154,6 +154,48 @@ def test_later_results_of_the_same_settings_stay_in_a_run(
     assert "fusion of alpha differs" in lines[0]
 
 
+def test_later_results_of_other_settings_go_from_a_run_whose_earlier_ones_are_up_to_date(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    out = small_runs / "other_later_settings"
+    shutil.copytree(small_run, out)
+    until = ("--until", "exchange", "--set", "fusion.max_added=3")
+    code, lines, _ = again(small_recording, out, *until)
+    assert code == 0
+    assert any("left out results of other settings or inputs" in line for line in lines)
+    assert names(out) == ABOUT | PREPARED | EXCHANGED
+    assert executed(out) == []
+    assert "up to date" in again(small_recording, out, *until)[1][0]
+
+
+def test_a_run_is_up_to_date_though_another_one_computed_one_of_its_stages_again(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    """The times of the stages, which the report shows, are not those of the store any more."""
+    out, store = small_runs / "first_of_two", small_runs / "store_of_two"
+    shutil.copytree(small_run, out)
+    shutil.copytree(small_runs / ".duagc-store", store)
+    shared = ("--store", str(store))
+    other = ("--from", "exchange", "--until", "exchange", *shared)
+    assert again(small_recording, small_runs / "second_of_two", *other)[0] == 0
+    code, lines, _ = again(small_recording, out, *shared)
+    assert (code, lines[0]) == (0, f"duagc: {out}: up to date")
+
+
+def test_metrics_of_another_evaluation_are_replaced_with_a_warning(
+    small_runs: Path, small_recording: Path, small_run: Path
+) -> None:
+    out = small_runs / "measured_again"
+    shutil.copytree(small_run, out)
+    (out / "metrics.json").write_text("{}")  # as `duagc evaluate --own-longer` writes it again
+    (out / "run.rrd").unlink()
+    code, lines, _ = again(small_recording, out)
+    assert code == 0
+    warned = f"duagc: warning: {out / 'metrics.json'}: was written by another evaluation since"
+    assert any(line.startswith(warned) for line in lines)
+    assert digest(out) == digest(small_run)
+
+
 def test_results_of_another_team_do_not_stay_in_a_run(
     small_runs: Path, small_recording: Path, small_run: Path
 ) -> None:

@@ -183,14 +183,21 @@ class Carrier:
     def _find(self, key: StageKey) -> StoredResults | None:
         if self.store is None or key.stage in self.again:
             return None
-        if (entry := self.store.find(key, self.say)) is not None:
-            return entry
-        stored = self.earlier.get(label(key.stage, key.robot), {})
+        stored, earlier = self.store.find(key, self.say), self._of_earlier_run(key)
+        if stored is None or earlier is None:
+            return stored or earlier
+        if earlier.result != stored.result:  # somebody has written into that manifest
+            return stored
+        # Another run may have computed the same again: in this place, the times that its report shows are its own.
+        return earlier if self.looking else replace(stored, timing=earlier.timing)
+
+    def _of_earlier_run(self, key: StageKey) -> StoredResults | None:
+        row = self.earlier.get(label(key.stage, key.robot), {})
         try:
-            if stored["key"] != key.digest:
+            if row["key"] != key.digest:
                 return None
-            files = {name: FileDigest(**digest) for name, digest in stored["files"].items()}
-            return StoredResults(key, files, stored["result"], stored["timing"])
+            files = {name: FileDigest(**digest) for name, digest in row["files"].items()}
+            return StoredResults(key, files, row["result"], row["timing"])
         except (KeyError, TypeError, AttributeError):  # somebody has written into that manifest
             return None
 
