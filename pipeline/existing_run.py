@@ -135,10 +135,10 @@ def keep_what_holds(
     earlier, made = stages_of(out), stages_of(folder)
     hold = _that_hold(recording, folder, config, plan, place=out)
     if stages.EVALUATION.name in made and plan.store is not None:
-        name = measured_otherwise(out, plan.store)
-        if name in made[stages.EVALUATION.name]["files"] and (out / name).is_file():
+        other = measured_otherwise(out, plan.store)
+        if other in made[stages.EVALUATION.name]["files"] and (out / other).is_file():
             log(
-                f"warning: {out / name}: was written by another evaluation since; replaced by that of this run"
+                f"warning: {out / other}: was written by another evaluation since; replaced by that of this run"
             )
     left_out = _results(out, earlier) - {name for carried in hold for name in carried.entry.files}
     lost = []

@@ -15,6 +15,7 @@ from pathlib import Path
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.stop_signals import start_resource_tracker
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.packages import check_packages
 from duagc.pipeline.config.run import RunConfig
@@ -102,6 +103,7 @@ def _run(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, l
 
 def _run_in_child(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> None:
     """`_run` in a process that is started with the settings of `determinism`; its lines come back to `log`."""
+    start_resource_tracker()
     lines: SimpleQueue[str | None] = multiprocessing.get_context("spawn").SimpleQueue()
 
     def relay() -> None:

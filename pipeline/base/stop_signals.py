@@ -1,6 +1,7 @@
 """The signals by which a command is stopped; all end it as Ctrl-C does, and it removes what is half written."""
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -8,10 +9,25 @@ ENDING = (signal.SIGTERM, signal.SIGHUP)  # of who wants a process to end, and o
 STOPPING = {signal.SIGINT, *ENDING}
 
 
+def start_resource_tracker() -> None:
+    """Start the process with which Python cleans up after others, where no signal of ENDING reaches it.
+
+    It outlives the others to do so, but a terminal that closes would end it with them.
+    """
+    from multiprocessing import resource_tracker
+
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 @contextmanager
 def ending_as_interrupts() -> Iterator[None]:
     """Take the signals of ENDING for Ctrl-C meanwhile, unless they are ignored, as nohup does."""
-    taken = [name for name in ENDING if signal.getsignal(name) is signal.SIG_DFL]
+    here = threading.current_thread() is threading.main_thread()  # no other one may handle signals
+    taken = [name for name in ENDING if here and signal.getsignal(name) is signal.SIG_DFL]
     for name in taken:
         signal.signal(name, signal.default_int_handler)
     try:

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.queues import SimpleQueue
 
+from duagc.pipeline.base.stop_signals import start_resource_tracker
+
 Step = tuple[str, str, int, int]
 """Of a robot: its name, what is done of it, steps done, steps in all; 0 of 0: it is done."""
 OF_TEAM = ""
@@ -45,6 +47,7 @@ def listening(hear: Hear) -> Iterator[SimpleQueue[Step | None]]:
     Args:
         hear: gets every step.
     """
+    start_resource_tracker()
     queue: SimpleQueue[Step | None] = multiprocessing.get_context("spawn").SimpleQueue()
 
     def relay() -> None:

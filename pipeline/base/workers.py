@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.stop_signals import STOPPING
+from duagc.pipeline.base.stop_signals import STOPPING, start_resource_tracker
 
 LOW_PRIORITY = 10
 """Nice value of what can wait: a tenth of a processor is left to it next to a task that cannot."""
@@ -53,6 +53,7 @@ def worker_pool(
     Raises:
         DuagError: a process ended before its task did, for example for want of memory.
     """
+    start_resource_tracker()
     before = {child.pid for child in multiprocessing.active_children()}
     pool = ProcessPoolExecutor(
         workers,
@@ -97,7 +98,8 @@ def _nothing() -> None:
 
 
 def _begin(handed_down: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for stop in (signal.SIGINT, signal.SIGHUP):  # of a terminal, which reach the parent as well
+        signal.signal(stop, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
     threading.Thread(target=end_with_parent, daemon=True).start()
     multiprocessing.util.Finalize(None, _end, exitpriority=LAST)

@@ -19,6 +19,7 @@ from typing import Literal
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.machine import processors
+from duagc.pipeline.base.stop_signals import ending_as_interrupts
 from duagc.pipeline.cache.claims import has_ended, this_process
 
 RUNS, CELLS = "runs", "cells"
@@ -165,7 +166,12 @@ def enter(arguments: Mapping[str, str], processors: tuple[int, ...] = ()) -> Non
     log = os.open(out / CELLS / f"{name}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     os.dup2(log, 1)
     os.dup2(log, 2)
-    error = run_cell(Path(arguments["suite"]), out, name, Path(arguments["store"]))
+    try:
+        with ending_as_interrupts():
+            error = run_cell(Path(arguments["suite"]), out, name, Path(arguments["store"]))
+    except KeyboardInterrupt:
+        error = "interrupted"
+        print(f"duagc: {error}", file=sys.stderr, flush=True)
     sys.exit(1 if error else 0)
 
 

@@ -16,7 +16,7 @@ from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from tests.fixtures import fake_run
-from tests.fixtures.commands import ROOT, assert_one_line, duagc, duagc_here
+from tests.fixtures.commands import ROOT, assert_one_line, duagc, duagc_here, listen_to_interrupts
 from tests.fixtures.recording_logs import write_camera
 
 
@@ -160,18 +160,13 @@ def test_an_output_that_appeared_meanwhile_is_kept(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "keep"]
 
 
-def _listen_to_interrupts() -> None:
-    """What a shell starts in the background, or nohup, is deaf to some; tests among it."""
-    for stop in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(stop, signal.SIG_DFL)
-
-
 @pytest.mark.parametrize(
     ("stop", "send"),
     [
         (signal.SIGINT, os.killpg),  # as a terminal does: parent and workers
         (signal.SIGTERM, os.kill),
         (signal.SIGHUP, os.kill),
+        (signal.SIGHUP, os.killpg),
     ],
 )
 def test_an_interrupted_command_is_one_line(
@@ -184,7 +179,7 @@ def test_an_interrupted_command_is_one_line(
         text=True,
         cwd=ROOT,
         start_new_session=True,
-        preexec_fn=_listen_to_interrupts,
+        preexec_fn=listen_to_interrupts,
     )
     deadline = time.monotonic() + 60
     while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
