@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.machine import memory_bytes
+from duagc.pipeline.base.said_lines import say_line
 from duagc.pipeline.cache.carrier import Carrier
 from duagc.pipeline.cache.code_identity import CodeVersion
 from duagc.pipeline.cache.footprint import fitting, robot_bytes
@@ -29,7 +29,7 @@ Say = Callable[[str], None]
 
 def say(line: str) -> None:
     """Say something on standard error."""
-    print(line, file=sys.stderr, flush=True)
+    say_line(line)
 
 
 def way(folder: Path, path: Path) -> str:

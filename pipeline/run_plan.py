@@ -38,6 +38,8 @@ class RunPlan:
     follow: bool = False
 
     def __post_init__(self) -> None:
+        if not isinstance(self.workers, int) or self.workers < 1:
+            raise DuagError(f"workers is {self.workers!r}, expected a whole number, 1 or more")
         for option, name in (("--from", self.since), ("--until", self.until)):
             if name is not None and name not in NAMES:
                 raise DuagError(f"{option} {name}: is no stage, {closest(name, NAMES, 'a stage')}")

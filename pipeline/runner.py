@@ -17,6 +17,7 @@ from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.stop_signals import start_resource_tracker
 from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.config.base import check_numbers
 from duagc.pipeline.config.packages import check_packages
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.existing_run import follow_recording, is_up_to_date, keep_what_holds
@@ -71,6 +72,7 @@ def run(
         raise DuagError(
             f"config is of type {type(config).__name__}, expected a RunConfig; load_config makes one"
         )
+    check_numbers(config, "config")
     check_packages(config)
     recording_path, out, store = Path(recording_path), Path(out), None if store is None else Path(store)
     check_apart(out, [recording_path] if store is None else [recording_path, store])

@@ -75,3 +75,7 @@ def test_places_may_be_texts(tmp_path: Path) -> None:
         duagc.run(str(fake.recording), run, duagc.RunConfig(), store=str(tmp_path / "store"))
     with pytest.raises(duagc.DuagError, match="config is of type dict, expected a RunConfig"):
         duagc.run(fake.recording, tmp_path / "out", {})  # type: ignore[arg-type]
+    with pytest.raises(duagc.DuagError, match="config: seed is -1, expected 0 or more"):
+        duagc.run(fake.recording, tmp_path / "out", duagc.RunConfig(seed=-1))
+    with pytest.raises(duagc.DuagError, match="workers is '2', expected a whole number, 1 or more"):
+        duagc.run(fake.recording, tmp_path / "out", duagc.RunConfig(), workers="2")  # type: ignore[arg-type]

@@ -207,7 +207,10 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
             groups[path.name] = inner
     if not groups:
         more = "".join(f"; {text}" for text in unread(src))
-        raise DuagError(f"{src}: found no log, expected one for each robot{more}")
+        own = next(
+            (f" but DUAG-C's own {path.name}" for path in sorted(src.iterdir()) if is_own_log(path)), ""
+        )
+        raise DuagError(f"{src}: found no log{own}, expected one for each robot{more}")
     return groups
 
 

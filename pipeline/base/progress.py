@@ -6,6 +6,8 @@ import time
 from collections.abc import Iterable, Iterator, Sized
 from typing import TypeVar
 
+from duagc.pipeline.base.said_lines import say_line
+
 Item = TypeVar("Item")
 PLAIN_LINE_EVERY_S = 10.0
 
@@ -45,4 +47,4 @@ def _lines(iterable: Iterable[Item], description: str, total: int | None) -> Ite
             last = now
             done = count + 1
             left = f", {(now - start) * (total - done) / done:.0f} s left" if total else ""
-            print(f"{description}: {done}{f'/{total}' if total else ''}{left}", file=sys.stderr, flush=True)
+            say_line(f"{description}: {done}{f'/{total}' if total else ''}{left}")

@@ -11,7 +11,6 @@ import errno
 import mmap
 import os
 import resource
-import sys
 import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,6 +18,8 @@ from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar, overload
 
 import numpy as np
+
+from duagc.pipeline.base.said_lines import say_line
 
 Value = TypeVar("Value")
 ALIGNMENT = 64
@@ -109,7 +110,7 @@ class Shelf:
             reason = error.strerror or os.strerror(error.errno or 0)
             if error.errno == errno.EMFILE:
                 reason = f"{reason} ({len(self._mappings)} of keyframes, see `ulimit -Hn`)"
-            print(f"warning: {tempfile.gettempdir()}: {reason}; keyframes stay in memory", file=sys.stderr)
+            say_line(f"warning: {tempfile.gettempdir()}: {reason}; keyframes stay in memory")
             return None
         self._mappings.add(mapping)
         return mapping

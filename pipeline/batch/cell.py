@@ -19,6 +19,7 @@ from typing import Literal
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.machine import processors
+from duagc.pipeline.base.said_lines import say_line
 from duagc.pipeline.base.stop_signals import ending_as_interrupts
 from duagc.pipeline.cache.claims import has_ended, this_process
 
@@ -109,7 +110,7 @@ def run_cell(suite_path: Path, out: Path, name: str, store: Path) -> str:
         traceback.print_exc()
         error = f"{type(failure).__name__}: {failure}"
     if error:
-        print(f"duagc: {error}", file=sys.stderr, flush=True)
+        say_line(f"duagc: {error}")
     wall_s = round(time.monotonic() - begin, 3)
     write_state(out, name, CellState("failed" if error else "done", attempts, wall_s, error))
     return error
@@ -123,7 +124,7 @@ def _run(suite_path: Path, out: Path, name: str, store: Path) -> None:
     from duagc.pipeline.runner import run
 
     def say(line: str) -> None:
-        print(f"duagc: {line}", file=sys.stderr, flush=True)
+        say_line(f"duagc: {line}")
 
     cell = read_suite(suite_path).cells[name]
     folder = run_folder(out, name)
@@ -171,7 +172,7 @@ def enter(arguments: Mapping[str, str], processors: tuple[int, ...] = ()) -> Non
             error = run_cell(Path(arguments["suite"]), out, name, Path(arguments["store"]))
     except KeyboardInterrupt:
         error = "interrupted"
-        print(f"duagc: {error}", file=sys.stderr, flush=True)
+        say_line(f"duagc: {error}")
     sys.exit(1 if error else 0)
 
 

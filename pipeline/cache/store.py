@@ -154,6 +154,8 @@ class Store:
                             source.unlink()
                     raise DamagedEntryError(f"{source}: has digest {found[:12]}, expected {digest.raw[:12]}")
                 os.replace(part, target)
+            except OSError as error:  # of a full disk, none says where
+                raise OSError(error.errno, error.strerror, error.filename or str(target)) from error
             finally:
                 part.unlink(missing_ok=True)
             self.files.keep(target, digest)

@@ -1,7 +1,6 @@
 """What the commands share: the application, options, how they speak. Light at import."""
 
 import os
-import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from duagc import __version__
+from duagc.pipeline.base.said_lines import say_line
 
 EXIT_FAILED, EXIT_DIFFERENT = 1, 3
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -79,7 +79,7 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON document on standar
 
 def say(line: str) -> None:
     """Progress goes to standard error, results to standard output."""
-    print(f"duagc: {line}", file=sys.stderr, flush=True)
+    say_line(f"duagc: {line}")
 
 
 def _print_version(wanted: bool) -> None:

@@ -93,7 +93,7 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
         raise DuagError(f"{_said_where(name, source, overrides)}: {name} is true or false, expected a number")
     try:
         config = model.model_validate(values)
-        _check_numbers(config, source)
+        check_numbers(config, source)
         return config
     except ValidationError as error:
         first = error.errors()[0]
@@ -130,15 +130,24 @@ def _booleans_for_numbers(model: type[Config], values: Mapping[str, Any], prefix
             yield f"{prefix}{name}"
 
 
-def _check_numbers(config: Config, source: str, prefix: str = "") -> None:
-    """Refuse numbers below 0 where a setting says nothing else, numbers that no machine holds, and lists of none."""
+def check_numbers(config: Config, source: str, prefix: str = "") -> None:
+    """Refuse numbers below 0 where a setting says nothing else, numbers that no machine holds, and lists of none.
+
+    Args:
+        config: settings.
+        source: where they are said, for the message.
+        prefix: of their names.
+
+    Raises:
+        DuagError: names the setting, what was found and what was expected.
+    """
     for name, field in type(config).model_fields.items():
         value, where = getattr(config, name), f"{source}: {prefix}{name}"
         if isinstance(value, tuple) and not value and field.default:
             raise DuagError(f"{where} is empty, expected one value or more")
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, Config):
-                _check_numbers(number, source, f"{prefix}{name}.")
+                check_numbers(number, source, f"{prefix}{name}.")
             elif isinstance(number, int | float):
                 if number < 0 and not field.metadata:
                     raise DuagError(f"{where} is {_short(number)}, expected 0 or more")

@@ -176,6 +176,13 @@ def test_a_claim_that_cannot_name_its_owner_is_given_up(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_no_room_for_what_the_store_has_is_told_with_its_place(bench: Bench) -> None:
+    bench.carry(write="x" * 5000)
+    with no_file_larger_than(1000), pytest.raises(OSError, match="File too large") as full:
+        bench.carry(write="x" * 5000)
+    assert full.value.filename == str(bench.folder / "run2" / "sum.txt")
+
+
 def test_an_earlier_run_serves_where_the_store_forgot(bench: Bench) -> None:
     carried = bench.carry()
     bench.object().unlink()
