@@ -216,7 +216,9 @@ def check_edges(robot: str, edges: DepthEdges | None, config: EdgeChecks) -> Ite
         return
     shifts, reach = config.shift_frames, config.shift_px
     frames, pixels = (int(np.argmax(a)) for a in (edges.by_frames, edges.by_pixels))
-    if edges.by_frames[frames] > config.clear_ratio * edges.by_frames[shifts]:
+    # late depth fits better from frame to frame up to its own; of smoothed depth few edges are left, which fit anywhere
+    own_time, others = edges.by_frames[shifts], edges.by_frames[[shifts - 1, shifts + 1]]
+    if edges.by_frames[frames] > config.clear_ratio * own_time and own_time < others.max():
         shift = frames - shifts
         yield Finding(
             Severity.WARNING,

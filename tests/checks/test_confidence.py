@@ -13,6 +13,7 @@ from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.checks import check, confidence, scale
 from duagc.pipeline.checks.findings import Finding, Severity, judged
+from duagc.pipeline.checks.geometry import DepthEdges, check_edges
 from duagc.pipeline.checks.moves import Move
 from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
 from duagc.pipeline.geometry import se3
@@ -131,3 +132,19 @@ def test_a_recording_of_a_pure_rotation_is_no_error(tmp_path: Path) -> None:
     of_scale = [f for f in report.findings if f.check == "depth scale"]
     assert [f.severity for f in of_scale] == [Severity.NOTE], check.format_report(report)
     assert "hardly translates" in of_scale[0].found
+
+
+@pytest.mark.parametrize(
+    ("fits", "said"),
+    [
+        ((1.30, 1.36, 1.41, 1.55, 1.86, 2.58, 1.89, 1.69, 1.54), ["depth in time"]),  # a frame late
+        (
+            (0.78, 0.89, 1.10, 1.53, 1.69, 1.49, 1.53, 1.49, 2.10),
+            [],
+        ),  # smoothed: the few edges left fit anywhere
+    ],
+)
+def test_late_depth_is_told_from_smoothed_depth(fits: tuple[float, ...], said: list[str]) -> None:
+    config = ChecksConfig().edges
+    edges = DepthEdges(np.tile(fits, (8, 1)), np.ones((8, 2 * config.shift_px + 1)))
+    assert [finding.check for finding in check_edges("alpha", edges, config)] == said
