@@ -60,8 +60,8 @@ class RobotWriter:
             sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's
                 metadata. `rolling_shutter_s` and `depth_rolling_shutter_s` say how long images are read
                 (`recording.rolling_shutter`).
-            find_regions: leave out large regions at the border that do not show the scene: black in all images, as a
-                vignette is, or the robot itself.
+            find_regions: leave out regions that do not show the scene: large ones at the border that are black in all
+                images, as a vignette is, or the robot itself; and what is drawn over all images.
         """
         if not re.fullmatch(topics.ROBOT_NAME, name):
             raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")

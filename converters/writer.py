@@ -50,6 +50,7 @@ SPELLING_ALPHABET = """
 ROBOT_NAMES = tuple(SPELLING_ALPHABET.split())
 FOUND = {
     "black": "are black in all images",
+    "drawn": "have edges that stay where they are while the camera moves, as text drawn over the images has",
     "body": "keep their depth while the camera moves, as what carries it does",
 }
 """Regions that do not show the scene, by the name that `RobotWriter` gives them."""

@@ -1,14 +1,16 @@
-"""Regions at the border of all images of a robot that do not show the scene, found while its frames are written."""
+"""Regions of all images of a robot that do not show the scene, found while its frames are written."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.converters.layouts.constant_edges import ConstantEdges
 from duagc.converters.layouts.own_body import OwnBody
 from duagc.converters.layouts.validity import BlackBorder
+from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.base.held_out import is_held_out
-from duagc.pipeline.geometry.lens import Maps
+from duagc.pipeline.geometry.lens import Maps, rectified
 from duagc.pipeline.geometry.masks import Mask
 
 EVERY, EVERY_NS = 8, 250_000_000  # a frame of so many is looked at, and one in so long a time
@@ -24,7 +26,8 @@ class FoundRegions:
         Args:
             maps: where in color images the pixels of the recording's camera lie; None: they are that camera's.
         """
-        self._black, self._body = BlackBorder(maps), OwnBody()
+        self._maps = maps
+        self._black, self._body, self._edges = BlackBorder(), OwnBody(), ConstantEdges()
         self._next_look_ns = 0
 
     def add(self, index: int, stamp_ns: int, color: bytes, depth: NDArray[np.uint16] | None) -> None:
@@ -40,15 +43,30 @@ class FoundRegions:
         if is_held_out(index) or (index % every and stamp_ns < self._next_look_ns):
             return
         self._next_look_ns = stamp_ns + EVERY_NS
-        self._black.add(color)
+        if (image := self._decoded(color)) is not None:  # else reading the recording will complain
+            self._black.add(image)
+            self._edges.add(image)
         if depth is not None:
             self._body.add(depth)
 
     def result(self, valid: Mask | None) -> dict[str, Mask]:
-        """Masks [h, w] of pixels that show the scene, by what the others show: "black", "body".
+        """Masks [h, w] of pixels that show the scene, by what the others show: "black", "body", "drawn".
 
         Args:
             valid: bool [h, w], pixels that show the scene by all that is known; None: all.
         """
         found = {"black": self._black.result(valid), "body": self._body.result()}
-        return {name: mask for name, mask in found.items() if mask is not None}
+        masks = {name: mask for name, mask in found.items() if mask is not None}
+        spread = self._body.spread()
+        if spread is not None and self._black.moved():
+            known = [mask for mask in (valid, *masks.values()) if mask is not None]
+            drawn = self._edges.result(~np.logical_and.reduce(known) if known else None, spread)
+            masks |= {} if drawn is None else {"drawn": drawn}
+        return masks
+
+    def _decoded(self, color: bytes) -> NDArray[np.uint8] | None:
+        """An image [h, w, 3], blue, green, red, of the recording's camera; None if it cannot be read."""
+        import cv2
+
+        image = decode_image(color, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        return image if image is None or self._maps is None else rectified(image, self._maps)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,7 @@ class OwnBody:
         self._images: list[NDArray[np.uint16]] = []
         self._shape = (0, 0)
         self._every = self._seen = 0
+        self._found: tuple[Stack, Stack, Stack] | None = None  # of `_measured`
 
     def add(self, depth: NDArray[np.uint16]) -> None:
         """Take a depth image of the recording; of many, some evenly spread ones are kept.
@@ -47,6 +50,7 @@ class OwnBody:
         if (self._seen - 1) % self._every:
             return
         step = self._step()
+        self._found = None
         self._images.append(depth[step // 2 :: step, step // 2 :: step].copy())
         if len(self._images) == MOST_IMAGES:
             self._images, self._every = self._images[::2], 2 * self._every
@@ -54,19 +58,43 @@ class OwnBody:
     def _step(self) -> int:
         return max(1, self._shape[1] // WIDTH)
 
+    def spread(self) -> Stack | None:
+        """Spread of every pixel's depth over its median, [h, w], NaN where it never has one.
+
+        None where the camera stood still, or too few images can tell.
+        """
+        found = self._measured()
+        return None if found is None else self._enlarged(found[2])
+
+    def _measured(self) -> tuple[Stack, Stack, Stack] | None:
+        """Share of the images in which a pixel has a depth, its median, and its spread over that; None as `spread`."""
+        if len(self._images) < LEAST_IMAGES:
+            return None
+        if self._found is None:
+            depth = np.stack(self._images).astype(np.float32)
+            known = (depth > 0).mean(axis=0)
+            low, middle, high = percentiles(np.where(depth > 0, depth, np.float32(np.nan)))
+            self._found = known, middle, (high - low) / middle
+        often = self._found[0] > 0.5
+        if not often.any() or np.median(self._found[2][often]) < MOVED:
+            return None
+        return self._found
+
+    def _enlarged(self, reduced: NDArray[Any]) -> NDArray[Any]:
+        """What is of the reduced images, of the whole ones."""
+        step = self._step()
+        rows, columns = (
+            np.minimum(np.arange(n) // step, m - 1) for n, m in zip(self._shape, reduced.shape, strict=True)
+        )
+        return np.asarray(reduced[np.ix_(rows, columns)])
+
     def result(self) -> Mask | None:
         """Pixels that show no body, bool [h, w]; None where none is seen, or the images cannot tell."""
         from scipy import ndimage
 
-        if len(self._images) < LEAST_IMAGES:
+        if (measured := self._measured()) is None:
             return None
-        depth = np.stack(self._images).astype(np.float32)
-        known = (depth > 0).mean(axis=0)
-        low, middle, high = percentiles(np.where(depth > 0, depth, np.float32(np.nan)))
-        spread = (high - low) / middle
-        often = known > 0.5
-        if not often.any() or np.median(spread[often]) < MOVED:
-            return None  # the camera stood still
+        known, middle, spread = measured
         still = (known >= KNOWN) & (spread < STILL)
         # the rim that undistortion leaves has no depth
         labels, _ = ndimage.label(still | (known == 0), np.ones((3, 3)))
@@ -77,12 +105,7 @@ class OwnBody:
                 found |= _with_edge(piece, middle)
         if not found.any():
             return None
-        grown = ndimage.binary_dilation(found, np.ones((3, 3)), GROW)
-        step = self._step()
-        rows, columns = (
-            np.minimum(np.arange(n) // step, m - 1) for n, m in zip(self._shape, grown.shape, strict=True)
-        )
-        return ~np.asarray(grown[np.ix_(rows, columns)])
+        return ~self._enlarged(ndimage.binary_dilation(found, np.ones((3, 3)), GROW))
 
 
 def percentiles(depth: Stack) -> Stack:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, read_bytes
-from duagc.pipeline.geometry.lens import Maps, rectified
 from duagc.pipeline.geometry.masks import Mask
 
 ALL_ROBOTS = ""
@@ -55,26 +54,20 @@ class BlackBorder:
     Before a camera that stands still what is dark stays dark: then nothing is found.
     """
 
-    def __init__(self, maps: Maps | None = None) -> None:
-        """Set up.
-
-        Args:
-            maps: where in the images the pixels of the recording's camera lie; None: they are that camera's.
-        """
-        self._maps = maps
+    def __init__(self) -> None:
+        """No image yet."""
         self._brightest: NDArray[np.uint8] | None = None
         self._images, self._every = 0, 1
         self._small: list[NDArray[np.float32]] = []
 
-    def add(self, data: bytes) -> None:
-        """Take an encoded color image of the recording; a few of every second do."""
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """Take a color image of the recording; a few of every second do.
+
+        Args:
+            image: [h, w, 3], blue, green, red.
+        """
         import cv2
 
-        image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            return  # reading the recording will complain
-        if self._maps is not None:
-            image = rectified(image, self._maps)
         blue, green, red = image[..., 0], image[..., 1], image[..., 2]
         value = np.maximum(np.maximum(blue, green), red)  # ten times as fast as max(axis=2)
         if np.percentile(value, BRIGHT_PERCENT) > BRIGHT and (
@@ -96,7 +89,7 @@ class BlackBorder:
         """
         from scipy import ndimage
 
-        if self._brightest is None or self._images < LEAST_IMAGES or not self._moved():
+        if self._brightest is None or self._images < LEAST_IMAGES or not self.moved():
             return None
         black = self._brightest <= BLACK
         outside = np.zeros_like(black) if valid is None else ~valid
@@ -109,8 +102,10 @@ class BlackBorder:
             return None
         return ~np.asarray(ndimage.binary_dilation(found, np.ones((3, 3)), GROW_PX))
 
-    def _moved(self) -> bool:
+    def moved(self) -> bool:
         """Whether what is not black changed, by more than exposure."""
+        if not self._small:
+            return False
         images = np.stack(self._small)
         lit = images[:, images.max(axis=0) > 2 * BLACK]
         if not lit.size:
