@@ -65,7 +65,11 @@ class PosePacket:
     converged: bool
 
     def part(self, index: slice | NDArray[np.int64]) -> PosePacket:
-        """The packet with some of its keyframes only."""
+        """The packet with some of its keyframes only.
+
+        Args:
+            index: slice, or places [k] among the keyframes of the packet.
+        """
         return replace(
             self,
             keyframes=self.keyframes[index],

@@ -50,15 +50,30 @@ class ColorMap:
         return bool(np.all(self.gain == 1) and np.all(self.offset == 0))
 
     def to_other(self, colors: NDArray[np.floating]) -> Array:
-        """Colors [n, 3] as the other camera shows them."""
+        """Colors [n, 3] as the other camera shows them.
+
+        Args:
+            colors: [n, 3], of this camera, 0..1.
+        """
         return np.asarray(self.gain * colors + self.offset, dtype=np.float64)
 
     def from_other(self, colors: NDArray[np.floating]) -> Array:
-        """Colors [n, 3] of the other camera as this one shows them."""
+        """Colors [n, 3] of the other camera as this one shows them.
+
+        Args:
+            colors: [n, 3], of the other camera, 0..1.
+        """
         return np.asarray((colors - self.offset) / self.gain, dtype=np.float64)
 
     def parameters(self, evidence: Evidence) -> Array:
-        """theta [n, 13] of evidence in the other camera's colors."""
+        """theta [n, 13] of evidence in the other camera's colors.
+
+        Args:
+            evidence: on n Gaussians, in this camera's colors.
+
+        Returns:
+            In the frame of the evidence; not a copy if the map is the identity.
+        """
         if self.is_identity:
             return evidence.theta
         theta = evidence.theta.copy()
@@ -66,7 +81,14 @@ class ColorMap:
         return theta
 
     def of(self, evidence: Evidence) -> Evidence:
-        """Evidence in the other camera's colors; every bit is kept by the identity."""
+        """Evidence in the other camera's colors; every bit is kept by the identity.
+
+        Args:
+            evidence: on n Gaussians, in this camera's colors.
+
+        Returns:
+            In the same frame; the information on colors is divided by the square of the gain.
+        """
         if self.is_identity:
             return evidence
         information = evidence.information.copy()
@@ -98,7 +120,11 @@ class TeamColors:
     matches: dict[tuple[str, str], int]
 
     def to_common(self, robot: str) -> ColorMap:
-        """From a robot's colors to the common ones."""
+        """From a robot's colors to the common ones.
+
+        Args:
+            robot: its name.
+        """
         i = self.robots.index(robot)
         return ColorMap(
             self.scale[robot],
@@ -109,7 +135,12 @@ class TeamColors:
         )
 
     def between(self, robot: str, other: str) -> ColorMap:
-        """From a robot's colors to another's."""
+        """From a robot's colors to another's.
+
+        Args:
+            robot: name of the one whose colors are converted.
+            other: name of the one whose colors they become.
+        """
         i, j = self.robots.index(robot), self.robots.index(other)
         scale = self.scale[other]
         return ColorMap(

@@ -98,7 +98,16 @@ class Front:
         self._coupling = self._rest = np.zeros((0, 0))
 
     def factorize(self, H_own: sparse.csc_matrix, children: Mapping[int, Array]) -> Array:
-        """Add the children's blocks [6 b, 6 b] to the own one, eliminate; returns H [6 s, 6 s] over the shared ones."""
+        """Add the children's blocks to the own one, eliminate; returns H [6 s, 6 s] over the shared ones.
+
+        Args:
+            H_own: sparse [6 v, 6 v], of the own factors, over the v own variables in the order in which they
+                were given.
+            children: by child, [6 b, 6 b], over its b shared variables.
+
+        Raises:
+            DuagError: what is to be eliminated is singular in its numbers.
+        """
         own = H_own.tocoo()
         slots = _lanes(self.own_slots)
         rows, columns, values = [slots[own.row]], [slots[own.col]], [own.data]
@@ -119,7 +128,12 @@ class Front:
         return 0.5 * (S + S.T)
 
     def eliminate(self, g_own: Array, children: Mapping[int, Array]) -> Array:
-        """The gradient [6 s] over the shared variables, from those of own variables [v, 6] and of children [6 b]."""
+        """The gradient [6 s] over the shared variables, after `factorize`.
+
+        Args:
+            g_own: [v, 6], of the own factors, by tangents (translation, rotation) of the own variables.
+            children: by child, [6 b], over its shared variables.
+        """
         g = np.zeros(6 * self.size)
         g[_lanes(self.own_slots)] = g_own.ravel()
         for child in sorted(children):
@@ -129,7 +143,14 @@ class Front:
         return g[e:] - self._coupling.T @ g[:e]
 
     def resolve(self, shared_step: Array) -> Array:
-        """Steps [v, 6] of all variables from those of the shared ones [s, 6]."""
+        """Steps of all variables from those of the shared ones, after `eliminate`.
+
+        Args:
+            shared_step: [s, 6], tangents (translation, rotation), m and rad.
+
+        Returns:
+            [e + s, 6], likewise: of the e eliminated variables, then of the shared ones.
+        """
         eliminated = -self._rest - self._coupling @ shared_step.ravel()
         return np.concatenate([eliminated, shared_step.ravel()]).reshape(-1, 6)
 

@@ -301,7 +301,15 @@ def _sums_of(gaussians: Gaussians, information: MapInformation | None) -> tuple[
 
 
 def rows_by_id(wanted: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The row of each wanted id in `ids`, -1 where it is not there."""
+    """The row of each wanted id in `ids`, -1 where it is not there.
+
+    Args:
+        wanted: int64 [n].
+        ids: int64 [m], in any order.
+
+    Returns:
+        int64 [n].
+    """
     if not len(ids):
         return np.full(len(wanted), -1, dtype=np.int64)
     order = np.argsort(ids, kind="stable")

@@ -40,7 +40,12 @@ _FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
 
 
 def held_thickness(vec_log_covariance: Array, floor_m: float) -> Array:
-    """Unit vectors v = vec(e e') [n, 3, 6] of the axes at the thickness floor; zero for the others."""
+    """Unit vectors v = vec(e e') [n, 3, 6] of the axes at the thickness floor; zero for the others.
+
+    Args:
+        vec_log_covariance: [n, 6], of Gaussians with standard deviations in meters.
+        floor_m: least standard deviation that the mapper allows.
+    """
     return in_blocks(lambda rows: _Axes.of(rows).held(floor_m), vec_log_covariance)
 
 
@@ -157,7 +162,12 @@ def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: M
 
 
 def threshold(own: Evidence, config: MapMatching) -> float:
-    """tau_G of a map: how much its own neighboring Gaussians differ; 0 if no two are within the radius."""
+    """tau_G of a map: how much its own neighboring Gaussians differ; 0 if no two are within the radius.
+
+    Args:
+        own: all Gaussians of the map, in any one frame.
+        config: radius, percentile and scales of the distance.
+    """
     if len(own) < 2:
         return 0.0
     return _threshold(_neighbors_compared(_Chart.of(own.theta, config), config), config)

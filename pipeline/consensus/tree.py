@@ -52,7 +52,12 @@ class TreePlace:
 
     @staticmethod
     def of(own: int, parent: Mapping[int, int | None]) -> TreePlace:
-        """From the parent of every robot of the component."""
+        """From the parent of every robot of the component.
+
+        Args:
+            own: own index.
+            parent: index of the parent by that of the robot; None for the root.
+        """
         subtree = 0
         for robot in parent:
             at: int | None = robot
@@ -116,13 +121,31 @@ class TreeNode:
     # --- messages
 
     def take_front(self, child: int, owners: dict[Variable, int]) -> None:
-        """A child's subtree shares these variables with others."""
+        """A child's subtree shares these variables with others.
+
+        Args:
+            child: index of the sender.
+            owners: mask of all robots that have each variable, by its owner's account; 0 if the owner is not
+                below.
+
+        Raises:
+            ValueError: it is not from a child, or came before.
+        """
         if child not in self.place.children or child in self._fronts:
             raise ValueError("front: not from a child, or received before")
         self._fronts[child] = owners
 
     def take_block(self, child: int, exchange: int, block: Block) -> None:
-        """What is left of a child's subtree in this exchange."""
+        """What is left of a child's subtree in this exchange.
+
+        Args:
+            child: index of the sender.
+            exchange: number of the exchange.
+            block: over the variables of its front, in their order.
+
+        Raises:
+            ValueError: it is of another exchange, or the first one has no matrix.
+        """
         if exchange != self.exchange:
             raise ValueError(f"block of exchange {exchange} in exchange {self.exchange}")
         if block.H is not None:
@@ -132,17 +155,36 @@ class TreeNode:
         self._blocks[child] = block
 
     def take_step(self, sender: int, step: BackSubstitution) -> None:
-        """The parent's answer."""
+        """The parent's answer.
+
+        Args:
+            sender: index of the robot that sent it.
+            step: of the variables of the own front, in their order.
+
+        Raises:
+            ValueError: it is not from the parent, or not of this exchange.
+        """
         if sender != self.place.parent:
             raise ValueError("step: not from the parent")
         self._descend(step)
 
     def waits_for_front(self, child: int) -> bool:
-        """Whether a child has not yet sent its shared variables."""
+        """Whether a child has not yet sent its shared variables.
+
+        Args:
+            child: index of the sender.
+        """
         return child in self.place.children and child not in self._fronts
 
     def variables_of(self, child: int) -> int:
-        """How many variables a child's blocks are about."""
+        """How many variables a child's blocks are about.
+
+        Args:
+            child: index of the sender.
+
+        Raises:
+            ValueError: it is no child, or has not sent its shared variables.
+        """
         if child not in self._fronts:
             raise ValueError("block: not from a child, or before its front")
         return len(self._fronts[child])

@@ -32,7 +32,11 @@ class Weights:
 
     @staticmethod
     def of(evidence: Evidence) -> Weights:
-        """Weights of evidence in the common frame."""
+        """Weights of evidence in the common frame.
+
+        Args:
+            evidence: on n Gaussians.
+        """
         return Weights(
             evidence.position_information(),
             evidence.shape_information(),
@@ -42,7 +46,11 @@ class Weights:
 
     @staticmethod
     def of_diagonal(diagonal: Array) -> Weights:
-        """Weights per coordinate [n, 13]."""
+        """Weights per coordinate [n, 13].
+
+        Args:
+            diagonal: [n, 13], information laid out as theta.
+        """
         return Weights(
             diagonal[:, MEAN, None] * np.eye(3),
             diagonal[:, LOG_COVARIANCE, None] * np.eye(6),
@@ -56,11 +64,19 @@ class Weights:
         return np.concatenate([position, shape, self.color, self.opacity[:, None]], axis=1)
 
     def take(self, rows: Index) -> Weights:
-        """Those of some rows."""
+        """Those of some rows.
+
+        Args:
+            rows: int64 [k].
+        """
         return Weights(self.position[rows], self.shape[rows], self.color[rows], self.opacity[rows])
 
     def plus(self, diagonal: Array) -> Weights:
-        """With more information per coordinate [n, 13]."""
+        """With more information per coordinate [n, 13].
+
+        Args:
+            diagonal: [n, 13], information laid out as theta.
+        """
         more = Weights.of_diagonal(diagonal)
         return Weights(
             self.position + more.position,
@@ -70,7 +86,11 @@ class Weights:
         )
 
     def times(self, values: Array) -> Array:
-        """W x [n, 13] of values [n, 13]."""
+        """W x [n, 13] of values [n, 13].
+
+        Args:
+            values: [n, 13], laid out as theta.
+        """
         return np.concatenate(
             [
                 (self.position @ values[:, MEAN, None])[..., 0],

@@ -233,7 +233,12 @@ class Algorithm1Solver:
     # --- packets
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
-        """Own keyframes of this round; as printed the matched means as well."""
+        """Own keyframes of this round; as printed the matched means as well.
+
+        Args:
+            neighbor: receiver of the packets.
+            room_bytes: most bytes of each part.
+        """
         room_bytes -= 1 + _HEAD.size
         quats_wxyz, translations = rounded(self._x, self.config.wire)
         packet = PosePacket(
@@ -255,7 +260,14 @@ class Algorithm1Solver:
         return parts
 
     def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
-        """Use poses or means that are not older than the last ones."""
+        """Use poses or means that are not older than the last ones.
+
+        Args:
+            neighbor: sender of the packet.
+            payload: one of its parts of a round, from `states`.
+        Raises:
+            MalformedError: it is cut short, or not what it should be.
+        """
         peer = self._peers[neighbor.index]
         if len(payload) < 1 + _HEAD.size:
             raise MalformedError("poses: cut short")
@@ -279,6 +291,12 @@ class Algorithm1Solver:
         return sent
 
     def take_message(self, sender: int, payload: bytes) -> None:
+        """Keep a neighbor's reliable message for the next round.
+
+        Args:
+            sender: index of the neighbor.
+            payload: set-up of the link or matched ids, which `advance` reads.
+        """
         self._arrived.append((sender, payload))
 
     def _take_arrived(self) -> None:
@@ -339,7 +357,11 @@ class Algorithm1Solver:
         return self._step
 
     def weights(self, peer: str) -> Array:
-        """There are no robust weights: what the links began with counts."""
+        """There are no robust weights: what the links began with counts.
+
+        Args:
+            peer: name of the neighbor.
+        """
         link = next(p.link for p in self._peers.values() if p.link.name == peer)
         return link.keep.astype(np.float64)
 
@@ -348,7 +370,11 @@ class Algorithm1Solver:
         return self._loops.copy()
 
     def refuted(self, peer: str) -> bool:
-        """Never."""
+        """Never.
+
+        Args:
+            peer: name of the neighbor.
+        """
         return False
 
     def residuals(self) -> dict[str, Any]:

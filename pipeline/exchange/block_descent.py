@@ -201,7 +201,12 @@ class BlockDescentSolver:
     # --- packets
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
-        """Own keyframes that loop closures name, unless the neighbor is known to have them or may just answer."""
+        """Own keyframes that loop closures name, unless the neighbor is known to have them or may just answer.
+
+        Args:
+            neighbor: receiver of the packets.
+            room_bytes: most bytes of each part.
+        """
         peer = self._peers[neighbor.index]
         has_them = peer.steps >= self._steps + (neighbor.index < self.own)
         if not self._steps or has_them or 0 < self._since < ANSWER_ROUNDS:
@@ -220,7 +225,16 @@ class BlockDescentSolver:
         return write_poses_in_parts(packet, room_bytes, decides=False)
 
     def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
-        """Use keyframes of a later step of the neighbor."""
+        """Use keyframes of a later step of the neighbor.
+
+        Args:
+            neighbor: sender of the packet.
+            payload: some of its keyframes in the common frame, from `states`.
+
+        Raises:
+            MalformedError: it is not what it should be, or of a step that this robot's last one does not
+                allow yet.
+        """
         peer = self._peers[neighbor.index]
         if peer.poses is None:
             return
@@ -241,6 +255,12 @@ class BlockDescentSolver:
         return sent
 
     def take_message(self, sender: int, payload: bytes) -> None:
+        """Keep a neighbor's reliable message for the next round.
+
+        Args:
+            sender: index of the neighbor.
+            payload: loop closures or their weights, which `advance` reads.
+        """
         self._arrived.append((sender, payload))
 
     def _take_arrived(self) -> None:
@@ -287,7 +307,14 @@ class BlockDescentSolver:
         return self._x.copy()
 
     def weights(self, peer: str) -> Array:
-        """At the end that found the loop closures; none at the other."""
+        """At the end that found the loop closures; none at the other.
+
+        Args:
+            peer: name of the neighbor.
+
+        Returns:
+            [m], 0 to 1, in the order in which the loop closures were given.
+        """
         found = next(p for p in self._peers.values() if p.link.name == peer)
         return found.weights.copy() if found.robust is not None else np.zeros(0)
 
@@ -296,6 +323,11 @@ class BlockDescentSolver:
         return self._loop_weights.weights.copy()
 
     def refuted(self, peer: str) -> bool:
+        """Whether final weights leave too few of the loop closures that this end holds with a neighbor.
+
+        Args:
+            peer: name of the neighbor.
+        """
         robust = next(p.robust for p in self._peers.values() if p.link.name == peer)
         if robust is None or not robust.done:
             return False

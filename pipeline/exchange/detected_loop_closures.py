@@ -104,6 +104,13 @@ class Provider(LoopClosureProtocol):
     """Sends descriptors and the samples that are requested; gets the verdict."""
 
     def __init__(self, database: KeyframeDatabase, peer: str, seed: int) -> None:
+        """Nothing was requested yet.
+
+        Args:
+            database: own keyframes.
+            peer: name of the neighbor.
+            seed: of this run.
+        """
         super().__init__(database.graph.robot, peer)
         self.database, self.config, self.seed = database, database.config, seed
         self.answered: set[int] = set()
@@ -140,6 +147,13 @@ class Verifier(LoopClosureProtocol):
     decides = True
 
     def __init__(self, database: KeyframeDatabase, peer: str, seed: int) -> None:
+        """Nothing is known of the neighbor yet.
+
+        Args:
+            database: own keyframes.
+            peer: name of the neighbor.
+            seed: of this run, for RANSAC and injected faults.
+        """
         super().__init__(database.graph.robot, peer)
         self.database, self.config, self.seed = database, database.config, seed
         self.planner: Planner | None = None

@@ -149,9 +149,24 @@ class ElectedSolver:
             self._outbox.append((child, elected_wire.write_answer(below)))
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
+        """Nothing: everything that this solver sends is a reliable message.
+
+        Args:
+            neighbor: the receiver.
+            room_bytes: not used.
+        """
         return []
 
     def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
+        """Refuse what a neighbor sent in a round: this solver uses no poses of a round.
+
+        Args:
+            neighbor: the sender.
+            payload: not read.
+
+        Raises:
+            ValueError: always.
+        """
         raise ValueError("state: poses, where an elected robot sends them in a message")
 
     def messages(self) -> list[tuple[int, bytes]]:
@@ -159,6 +174,12 @@ class ElectedSolver:
         return sent
 
     def take_message(self, sender: int, payload: bytes) -> None:
+        """Use graphs of a child, or the answer of the parent; what cannot be used goes to `refused`.
+
+        Args:
+            sender: index of the neighbor.
+            payload: of its message, from `elected_wire`.
+        """
         try:
             if sender in self.start.tree.children and sender not in self._parts:
                 self._parts[sender] = self._read_graphs(sender, payload)
@@ -194,6 +215,14 @@ class ElectedSolver:
         return found.T_world_keyframe.copy()
 
     def weights(self, peer: str) -> Array:
+        """Robust weight of every loop closure held with a neighbor; before the answer, what it begins with.
+
+        Args:
+            peer: name of the neighbor.
+
+        Returns:
+            [m], 0 to 1, in the order in which the loop closures were given; 0 where they were left out.
+        """
         index = self._index[peer]
         keep = self._keep.get(index, np.zeros(0, bool))
         if self._answer is None or not len(keep):
@@ -207,6 +236,11 @@ class ElectedSolver:
         return _expanded(self._answer.loop_weights, self._keep_loops)
 
     def refuted(self, peer: str) -> bool:
+        """Whether the answer leaves too few of the loop closures held with a neighbor; False before it.
+
+        Args:
+            peer: name of the neighbor.
+        """
         index = self._index[peer]
         if self._answer is None or index not in self._own.closures:
             return False

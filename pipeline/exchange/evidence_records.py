@@ -33,6 +33,15 @@ VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
 def own_records(data: RobotData, kind: Kind, weights: WeightKind) -> Records:
     """A robot's own evidence in the frames of its anchors, in the precision of this kind of evidence.
 
+    Args:
+        data: of this robot.
+        kind: of the evidence; says the precision of the records.
+        weights: what a Gaussian weighs by, `exchange.weights`.
+
+    Returns:
+        [n] of `record_dtype(kind)`, with theta [13] and information [31] of every Gaussian, meters, in its
+        anchor's frame.
+
     Raises:
         DuagError: some of it is not finite; integers of the compact kind cannot say so.
     """
@@ -50,7 +59,15 @@ def own_records(data: RobotData, kind: Kind, weights: WeightKind) -> Records:
 
 
 def to_records(evidence: Evidence, kind: Kind) -> Records:
-    """Records of evidence, in the same order."""
+    """Records of evidence, in the same order.
+
+    Args:
+        evidence: on n Gaussians, each in the frame of its anchor.
+        kind: of the evidence; says the precision of the records.
+
+    Returns:
+        [n] of `record_dtype(kind)`.
+    """
     records = np.zeros(len(evidence), record_dtype(kind))
     records["id"], records["anchor"] = evidence.ids, evidence.anchors
     records["theta"], records["information"] = evidence.theta, evidence.information
@@ -58,7 +75,12 @@ def to_records(evidence: Evidence, kind: Kind) -> Records:
 
 
 def to_evidence(owner: str, records: Records) -> Evidence:
-    """Evidence of records, in the same order."""
+    """Evidence of records, in the same order.
+
+    Args:
+        owner: name of the robot that the evidence is of.
+        records: [n], in the frames of its keyframes.
+    """
     return Evidence(owner, records["id"], records["anchor"], records["theta"], records["information"])
 
 
@@ -66,13 +88,20 @@ def gain(records: Records) -> Array:
     """Expected information gain [n], nats: 1/2 sum over dimensions of log(1 + information * prior variance).
 
     It has no unit, unlike the paper's (4), which adds 1/m^2 to 1/rad^2. All records have the same size.
+
+    Args:
+        records: [n], with information in 1/m^2 and without a unit (log-covariance, color, opacity).
     """
     known = np.maximum(records["information"][:, INFORMATION_DIAGONAL].astype(np.float64), 0.0)
     return 0.5 * np.log1p(known * PRIOR_SIGMA**2).sum(axis=1)
 
 
 def paper_priority(records: Records) -> Array:
-    """The paper's (4) [n]: the sum of the information over all dimensions, which depends on the unit of length."""
+    """The paper's (4) [n]: the sum of the information over all dimensions, which depends on the unit of length.
+
+    Args:
+        records: [n], with information in 1/m^2 and without a unit (log-covariance, color, opacity).
+    """
     return np.maximum(records["information"][:, INFORMATION_DIAGONAL].astype(np.float64), 0.0).sum(axis=1)
 
 
@@ -93,14 +122,28 @@ def order_of_sending(records: Records, order: EvidenceOrder, seed: int, robot: s
 
 
 def voxel_keys(points: Array, edge_m: float) -> NDArray[np.int64]:
-    """Key of the voxel of every point [n, 3]."""
+    """Key of the voxel of every point [n, 3].
+
+    Args:
+        points: [n, 3], meters, in the frame in which the grid is laid out.
+        edge_m: of a voxel, meters.
+
+    Returns:
+        int64 [n], 20 bits per axis.
+    """
     half = 1 << (VOXEL_BITS - 1)
     cell = np.clip(np.floor(points / edge_m), -half, half - 1).astype(np.int64) + half
     return (cell[:, 0] << 2 * VOXEL_BITS) | (cell[:, 1] << VOXEL_BITS) | cell[:, 2]
 
 
 def seen_voxels(gaussians: Gaussians, T_world_map: Array, edge_m: float) -> NDArray[np.int64]:
-    """Ascending keys of the voxels with a Gaussian of this map, and of those around them."""
+    """Ascending keys of the voxels with a Gaussian of this map, and of those around them.
+
+    Args:
+        gaussians: of the own map, in the map frame.
+        T_world_map: [4, 4], own map frame in the common frame in which the grid is laid out.
+        edge_m: of a voxel, meters.
+    """
     points = se3.transform(T_world_map, gaussians.means.astype(np.float64))
     steps = np.array(np.meshgrid(*[[-1, 0, 1]] * 3)).reshape(3, -1).T * edge_m
     occupied = np.unique(np.floor(points / edge_m), axis=0) * edge_m + 0.5 * edge_m

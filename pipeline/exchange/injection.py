@@ -62,7 +62,15 @@ def false_closures(
 def false_matches(
     pairs: NDArray[np.int64], config: InjectionConfig, *, seed: int, robot: str, peer: str
 ) -> NDArray[np.int64]:
-    """Pairs [n, 2] of which `config.false_matches` have exchanged partners."""
+    """Pairs [n, 2] of which `config.false_matches` have exchanged partners.
+
+    Args:
+        pairs: int64 [n, 2], ids of matched Gaussians.
+        config: how many are to be false.
+        seed: of this run.
+        robot: own name.
+        peer: name of the other robot.
+    """
     rng = random_streams.generator(seed, "injection.matches", robot=robot, peer=peer)
     chosen = np.flatnonzero(rng.random(len(pairs)) < config.false_matches)
     out = pairs.copy()
@@ -71,7 +79,15 @@ def false_matches(
 
 
 def poses_are_missing(config: InjectionConfig, *, seed: int, robot: str, peer: str, round_index: int) -> bool:
-    """Whether a robot sends no poses to a neighbor in this round."""
+    """Whether a robot sends no poses to a neighbor in this round.
+
+    Args:
+        config: how often poses are left out.
+        seed: of this run.
+        robot: own name.
+        peer: name of the neighbor.
+        round_index: the current round.
+    """
     if config.pose_dropouts == 0.0:
         return False
     rng = random_streams.generator(seed, "injection.poses", robot=robot, peer=peer, round=round_index)

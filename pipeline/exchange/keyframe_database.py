@@ -36,6 +36,13 @@ class KeyframeDatabase:
     """A robot's own keyframes as others may request them; computed when first needed."""
 
     def __init__(self, data: RobotData, config: ExchangeConfig, recall: Recalling = computed) -> None:
+        """Lay out the own graph; images are read when they are needed.
+
+        Args:
+            data: of this robot.
+            config: the same at all robots.
+            recall: slow results; they change no bit.
+        """
         self.data, self.config, self.recall = data, config, recall
         self._pyramid = lru_cache(maxsize=PYRAMIDS_KEPT)(self._build_pyramid)
         self._features: list[Features] | None = None
@@ -72,7 +79,11 @@ class KeyframeDatabase:
         return features, coarse_depth(images.depth_m)
 
     def rectified(self, keyframe: int) -> Features:
-        """Features of the surfaces that a keyframe sees from the side, as if the camera faced them."""
+        """Features of the surfaces that a keyframe sees from the side, as if the camera faced them.
+
+        Args:
+            keyframe: its index.
+        """
         if keyframe not in self._rectified:
             self._rectified[keyframe] = self.recall(
                 f"rectified features {self.data.robot} {keyframe}", partial(self._faced, keyframe)
@@ -85,7 +96,15 @@ class KeyframeDatabase:
         return extract_rectified(gray, self.pyramid(keyframe), c.features_per_keyframe, c.rectified_planes)
 
     def agreement(self, samples: Sequence[NDArray[np.floating]], T_first_peer: Array) -> float:
-        """How well own depth images agree with a neighbor's samples [m, 3], keyframes at T_first_peer [k, 4, 4]."""
+        """How well own depth images agree with a neighbor's samples.
+
+        Args:
+            samples: of each of the k keyframes, points [m, 3], meters, in its camera frame.
+            T_first_peer: [k, 4, 4], these keyframes as seen from the first own keyframe.
+
+        Returns:
+            Share of the samples that own keyframes see at the same place, 0 to 1.
+        """
         assert len(self.features) == len(self._coarse_depths)  # which reads the images
         return surface_agreement(
             self._coarse_depths,
@@ -98,7 +117,16 @@ class KeyframeDatabase:
     def overlaps(
         self, closures: Sequence[LoopClosure], peer: KeyframePoses, peer_camera: PinholeCamera
     ) -> dict[tuple[int, int], float]:
-        """How much of own views a neighbor's keyframes should see, by both, near loop closures with it."""
+        """How much of own views a neighbor's keyframes should see, by both, near loop closures with it.
+
+        Args:
+            closures: verified, from the own side.
+            peer: the neighbor's keyframes, in any one frame.
+            peer_camera: of the neighbor.
+
+        Returns:
+            Share of the own view, 0 to 1, by own keyframe and the neighbor's.
+        """
         return overlaps(
             closures,
             self._coarse_depths,
@@ -109,7 +137,11 @@ class KeyframeDatabase:
         )
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
-        """Images of a keyframe at several resolutions."""
+        """Images of a keyframe at several resolutions.
+
+        Args:
+            keyframe: its index.
+        """
         return self._pyramid(keyframe)
 
     def _build_pyramid(self, keyframe: int) -> RgbdPyramid:
@@ -131,7 +163,11 @@ class KeyframeDatabase:
         return DescriptorSet(compact, self.graph.T_first_keyframe, self.graph.drift, self.data.camera)
 
     def sample(self, keyframe: int) -> KeyframeSample:
-        """What a neighbor gets to verify loop closures with one keyframe."""
+        """What a neighbor gets to verify loop closures with one keyframe.
+
+        Args:
+            keyframe: its index.
+        """
         reference = Reference.sample(self.pyramid(keyframe), self.config.verification.samples)
         return KeyframeSample(keyframe, self.features[keyframe], reference)
 

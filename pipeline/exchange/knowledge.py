@@ -58,7 +58,16 @@ class Knowledge:
         self.pairs_bytes: dict[tuple[int, int], bytes] = {}
 
     def take_evidence(self, provider: int, message: int, payload: bytes, complete: bool) -> int | None:
-        """Take a chunk, or the complete message. Returns the owner if its evidence is here completely.
+        """Take a chunk, or the complete message.
+
+        Args:
+            provider: index of the neighbor that sent it.
+            message: its id, unique for that neighbor.
+            payload: bytes of the chunk, or of the whole message.
+            complete: whether it is the whole message.
+
+        Returns:
+            Index of the owner if its evidence is here completely, else None.
 
         Raises:
             MalformedError: it is not what it should be; nothing of it is kept.
@@ -81,7 +90,11 @@ class Knowledge:
         return owner
 
     def forget_incoming(self, owner: int) -> list[tuple[int, int]]:
-        """Drop what else is arriving of an owner that is complete; returns (provider, message)."""
+        """Drop what else is arriving of an owner that is complete; returns (provider, message).
+
+        Args:
+            owner: index of the robot whose evidence it is.
+        """
         keys = sorted(k for k, entry in self.incoming.items() if entry.owner == owner)
         for key in keys:
             del self.incoming[key]
@@ -107,7 +120,14 @@ class Knowledge:
         return out
 
     def take_anchors(self, payload: bytes) -> int:
-        """Take agreed poses, if they are new; returns their owner."""
+        """Take agreed poses, if they are new; returns their owner.
+
+        Args:
+            payload: of ANCHORS.
+
+        Raises:
+            MalformedError: it is not what it should be, or speaks for this robot.
+        """
         anchors = anchors_wire.read_anchors(payload, self.team)
         if anchors.owner == self.own:
             raise MalformedError("anchors: a neighbor speaks for this robot")
@@ -116,7 +136,14 @@ class Knowledge:
         return anchors.owner
 
     def take_pairs(self, payload: bytes) -> tuple[int, int]:
-        """Take a pair list, if it is new; returns the pair. The lower-named robot of a pair speaks for it."""
+        """Take a pair list, if it is new; returns the pair. The lower-named robot of a pair speaks for it.
+
+        Args:
+            payload: of PAIRS.
+
+        Raises:
+            MalformedError: it is not what it should be, or speaks for this robot.
+        """
         pairs = state_wire.read_pairs(payload, self.team)
         key = (pairs.lower, pairs.higher)
         if pairs.lower == self.own:
@@ -126,7 +153,14 @@ class Knowledge:
         return key
 
     def records(self, owner: int) -> Records:
-        """All records of an owner that are here, whether complete or not, each id once, sorted by id."""
+        """All records of an owner that are here, whether complete or not, each id once, sorted by id.
+
+        Args:
+            owner: index of the robot.
+
+        Returns:
+            [n] of `record_dtype` of the kind of this team, in the frames of the owner's keyframes.
+        """
         if owner in self.evidence:
             records = self.evidence[owner]
         else:
@@ -139,12 +173,23 @@ class Knowledge:
         return records[first]
 
     def depth(self, owner: int) -> DepthKind | None:
-        """Of a Gaussian at a pixel, as the owner's map was made; None if nothing of its evidence is here."""
+        """Of a Gaussian at a pixel, as the owner's map was made; None if nothing of its evidence is here.
+
+        Args:
+            owner: index of the robot.
+        """
         head = self._head(owner)
         return None if head is None else head[0]
 
     def share(self, owner: int) -> float:
-        """Share of an owner's evidence that is here, by what it says of the number of its Gaussians."""
+        """Share of an owner's evidence that is here, by what it says of the number of its Gaussians.
+
+        Args:
+            owner: index of the robot.
+
+        Returns:
+            0 to 1.
+        """
         head = self._head(owner)
         if owner in self.evidence or head is None:
             return float(owner in self.evidence)
@@ -160,6 +205,10 @@ class Knowledge:
         return evidence_wire.read_evidence_head(self.kind, chunks[0][:EVIDENCE_HEAD_BYTES], self.team)[1:]
 
     def sound_records(self, poses: PlacedKeyframes) -> Records:
-        """`records` of an owner whose anchor is among its poses."""
+        """`records` of an owner whose anchor is among its poses.
+
+        Args:
+            poses: of the owner's keyframes; only the owner and their number count.
+        """
         records = self.records(poses.owner)
         return records[records["anchor"] < len(poses.T_common_keyframe)]

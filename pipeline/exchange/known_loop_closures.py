@@ -75,11 +75,24 @@ class KnownLoopClosures:
         self.trusted = held_by_both or not config.robust
 
     def initial(self, peer: str) -> LoopClosureProtocol:
-        """The protocol with a neighbor."""
+        """The protocol with a neighbor.
+
+        Args:
+            peer: name of the neighbor, with which there are loop closures.
+        """
         return KnownPair(self, peer)
 
     def protocol(self, peer: str, kind: Kind, payload: bytes) -> LoopClosureProtocol:
-        """Never needed: `initial` gives every protocol."""
+        """Never needed: `initial` gives every protocol.
+
+        Args:
+            peer: name of the neighbor.
+            kind: of its message.
+            payload: not read.
+
+        Raises:
+            MalformedError: always.
+        """
         raise MalformedError(f"{kind.name} is not for known loop closures")
 
 
@@ -91,6 +104,12 @@ class KnownPair(LoopClosureProtocol):
     """
 
     def __init__(self, source: KnownLoopClosures, peer: str) -> None:
+        """Take the loop closures of the pair; an end that does not hold them has decided.
+
+        Args:
+            source: of this robot.
+            peer: name of the neighbor, with which there are loop closures.
+        """
         super().__init__(source.own.robot, peer)
         self.source, self.closures = source, source.closures[peer]
         self.decides = holder(self.own, peer, self.closures) == self.own
@@ -110,6 +129,11 @@ class KnownPair(LoopClosureProtocol):
         return SharedKeyframes(keyframes.astype(np.int32), metric)
 
     def begin(self, send: Send) -> None:
+        """Send the own keyframes that loop closures name, if the other end holds these.
+
+        Args:
+            send: queues a message for the neighbor.
+        """
         if self._peer_holds:
             own = self.source.own
             named = np.unique([c.own_keyframe for c in self.closures]).astype(np.int32)
@@ -120,6 +144,13 @@ class KnownPair(LoopClosureProtocol):
         return [c for c, selected in zip(self.closures, self.in_solver.tolist(), strict=True) if selected]
 
     def select(self, T_world_own: Array, T_world_peer: Array, send: Send) -> None:
+        """Select the plausible loop closures where the two robots were placed, at the end that decides.
+
+        Args:
+            T_world_own: [4, 4], where the first own keyframe was placed.
+            T_world_peer: [4, 4], where the first keyframe of the neighbor was placed.
+            send: queues a message for the neighbor.
+        """
         if not self._holds:
             return
         assert self.joined is not None
@@ -149,6 +180,16 @@ class KnownPair(LoopClosureProtocol):
         self.joined = JoinedPair(self._shared_at_peer())
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
+        """Use the keyframes that loop closures name, or what the other end selected.
+
+        Args:
+            kind: KEYFRAMES or REQUEST.
+            payload: of the message.
+            send: not used.
+
+        Raises:
+            MalformedError: it is not for this end, came twice, or is not what it should be.
+        """
         if kind is Kind.REQUEST and not self._holds and not self.selected:
             self._take_selection(payload)
             return

@@ -49,7 +49,15 @@ class LinkStarts:
     trusted: bool
 
     def of(self, n: Neighbor) -> LinkStart:
-        """A joined neighbor; loop closures start with weight if they fit to where both robots were placed."""
+        """A joined neighbor; loop closures start with weight if they fit to where both robots were placed.
+
+        Args:
+            n: the neighbor; its protocol has ended, and joined the two robots.
+
+        Returns:
+            The link, with the neighbor's keyframes in the common frame where this end holds the loop
+            closures.
+        """
         protocol = n.loop_closing
         assert protocol is not None
         assert protocol.joined is not None

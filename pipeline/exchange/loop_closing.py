@@ -126,6 +126,12 @@ class LoopClosureProtocol:
     selected = True
 
     def __init__(self, own: str, peer: str) -> None:
+        """Nothing is decided.
+
+        Args:
+            own: name of this robot.
+            peer: name of the neighbor.
+        """
         self.own, self.peer = own, peer
         self.decided = False
         self.joined: JoinedPair | None = None
@@ -138,7 +144,11 @@ class LoopClosureProtocol:
         return not self.decided and any(t.result.closure is not None for t in self.tried)
 
     def begin(self, send: Send) -> None:
-        """Called once, when the ends know their roles."""
+        """Called once, when the ends know their roles.
+
+        Args:
+            send: queues a message for the neighbor.
+        """
 
     def select(self, T_world_own: Array, T_world_peer: Array, send: Send) -> None:
         """Called until `selected`, once the whole component knows where its maps lie; default: all are selected.
@@ -151,6 +161,11 @@ class LoopClosureProtocol:
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         """Use one complete message of this protocol.
+
+        Args:
+            kind: of the message.
+            payload: of the message.
+            send: queues a message for the neighbor.
 
         Raises:
             MalformedError: it is not for this end, came twice, or is not what it should be.
@@ -174,7 +189,11 @@ class LoopClosing(Protocol):
         """Payload of HELLO, from which the roles of the two ends follow; None if they are known without."""
 
     def initial(self, peer: str) -> LoopClosureProtocol | None:
-        """The protocol with a neighbor that needs no greeting; else None."""
+        """The protocol with a neighbor that needs no greeting; else None.
+
+        Args:
+            peer: name of the neighbor.
+        """
 
     def protocol(self, peer: str, kind: Kind, payload: bytes) -> LoopClosureProtocol:
         """The protocol with a neighbor, from its first message.

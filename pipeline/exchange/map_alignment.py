@@ -60,7 +60,14 @@ class MapAlignment:
         return pair
 
     def add(self, frames: RelativeFrames) -> None:
-        """Add what this robot itself decided, as all others will read it."""
+        """Add what this robot itself decided, as all others will read it.
+
+        Args:
+            frames: of one pair, from the higher-named robot's frame to the lower-named one's.
+
+        Raises:
+            MalformedError: other robots would refuse to read them.
+        """
         payload = state_wire.write_relative_frames(frames, short=self.short)
         read = state_wire.read_relative_frames(payload, len(self.team))
         self._know((frames.lower, frames.higher), read, payload)
@@ -71,7 +78,11 @@ class MapAlignment:
         self._members, self._placement = [], None
 
     def revoke(self, known: int) -> None:
-        """Revoke these links, a mask of `pair_bit`: they do not count any more."""
+        """Revoke these links: they do not count any more.
+
+        Args:
+            known: all revoked links, earlier ones too, a mask of `pair_bit`.
+        """
         self.revoked, self._members, self._placement = known, [], None
 
     def _alive(self) -> list[Pair]:
@@ -112,7 +123,11 @@ class MapAlignment:
         return sum(pair_bit(self.team.index(a), self.team.index(b)) for a, b in pairs)
 
     def T_world_first(self, robot: int) -> Array:  # noqa: N802 (a transform)
-        """First keyframe of a member in that of the root, [4, 4]."""
+        """First keyframe of a member in that of the root, [4, 4].
+
+        Args:
+            robot: index of the member in the sorted team.
+        """
         return self.placement.T_world_map[self.team[robot]]
 
     def tree(self) -> TreePlace:

@@ -130,7 +130,12 @@ class Planner:
         self._outcomes: list[tuple[Candidate, float]] = []  # and the probability that it is a loop closure
 
     def take(self, candidate: Candidate, closure: bool) -> None:
-        """What became of a candidate."""
+        """What became of a candidate.
+
+        Args:
+            candidate: that was tried.
+            closure: whether it was verified as a loop closure.
+        """
         self._chosen.add(candidate.ends)
         self._outcomes.append((candidate, float(closure)))
 

@@ -145,13 +145,26 @@ class Radio:
         return self._messages
 
     def send(self, neighbor: Neighbor, kind: Kind, payload: bytes) -> int:
-        """Queue one reliable message; returns its id."""
+        """Queue one reliable message; returns its id.
+
+        Args:
+            neighbor: its receiver.
+            kind: of its content.
+            payload: its bytes.
+
+        Raises:
+            DuagError: it is longer than `max_message_bytes`.
+        """
         message = Message(self.new_id(), kind, payload)
         neighbor.transport.send(message)
         return message.id
 
     def sender(self, neighbor: Neighbor) -> Send:
-        """What queues the messages of the loop-closing protocol with a neighbor."""
+        """What queues the messages of the loop-closing protocol with a neighbor.
+
+        Args:
+            neighbor: the receiver.
+        """
 
         def send(kind: Kind, payload: bytes) -> None:
             message = self.send(neighbor, kind, payload)

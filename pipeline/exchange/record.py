@@ -44,7 +44,11 @@ class RawAlternative:
 
     @staticmethod
     def of(data: Sequence[RobotData]) -> RawAlternative:
-        """What it takes for a team; components of one robot count as that robot."""
+        """What it takes for a team; components of one robot count as that robot.
+
+        Args:
+            data: of all robots, or of their components.
+        """
         others = len({robot_of(d.robot) for d in data}) - 1
         gaussians, factors = sum(len(d.gaussians) for d in data), sum(len(d.registrations) for d in data)
         return RawAlternative(
@@ -62,6 +66,11 @@ class ExchangeRecorder:
     """Writes exchange.mcap."""
 
     def __init__(self, writer: LogWriter) -> None:
+        """Nothing was sent.
+
+        Args:
+            writer: of the log.
+        """
         self.writer = writer
         self._known: set[tuple[str, int]] = set()
         self._on_air: set[tuple[str, int]] = set()  # of these, what a radio carried
@@ -69,7 +78,15 @@ class ExchangeRecorder:
         self._totals: dict[tuple[str, str, str], list[int]] = {}  # packets, dropped, bytes, bytes delivered
 
     def packet(self, sender: str, out: Outgoing, *, round_index: int, send_ns: int, fate: Fate) -> None:
-        """Record one packet, and its message if this is the first packet of it."""
+        """Record one packet, and its message if this is the first packet of it.
+
+        Args:
+            sender: name of the robot that sent it.
+            out: the packet, its receiver and its message.
+            round_index: in which it was sent.
+            send_ns: when it was sent, time of the session.
+            fate: when its copies are delivered, or why it was dropped.
+        """
         self._message(sender, out, send_ns)
         length = payload_bytes(out.packet)
         end = HEADER_BYTES + length
@@ -124,7 +141,15 @@ class ExchangeRecorder:
     def summary(
         self, team: list[str], *, rounds: int, converged: bool, raw: RawAlternative, now_ns: int
     ) -> None:
-        """Record what the session cost."""
+        """Record what the session cost.
+
+        Args:
+            team: names, sorted.
+            rounds: how many there were.
+            converged: whether every robot has all that it should have.
+            raw: for comparison.
+            now_ns: time of the last round.
+        """
         message = schemas.new(
             "ExchangeSummary",
             team=team,
@@ -201,6 +226,9 @@ class RecordedPacket:
 def read_session(exchange_path: Path) -> Recorded:
     """A session with every packet rebuilt from its header and its message.
 
+    Args:
+        exchange_path: its exchange.mcap.
+
     Raises:
         DuagError: a packet refers to a message that is not there or is not what its header says; no summary.
     """
@@ -257,11 +285,22 @@ class ConsensusRecorder:
     """Writes consensus.mcap."""
 
     def __init__(self, writer: LogWriter) -> None:
+        """Nothing was written.
+
+        Args:
+            writer: of the log.
+        """
         self.writer = writer
         self._last: dict[str, bytes] = {}
 
     def round(self, agent: MapAgent, round_index: int, now_ns: int) -> None:
-        """Record where an agent stands, if that changed, and its pose round, if there was one."""
+        """Record where an agent stands, if that changed, and its pose round, if there was one.
+
+        Args:
+            agent: after its tick of this round.
+            round_index: the round.
+            now_ns: its time in the session.
+        """
         robot = agent.data.robot
         self._write_changed(topics.AGENT_ROUND.of(robot), self._agent(agent), round_index, now_ns)
         if agent.poses is not None:
@@ -324,7 +363,12 @@ class ConsensusRecorder:
         return message
 
     def result(self, result: SessionResult, now_ns: int) -> None:
-        """Record what became of every candidate."""
+        """Record what became of every candidate.
+
+        Args:
+            result: of one robot.
+            now_ns: time of the last round.
+        """
         for c in result.closures:
             message = schemas.new(
                 "LoopClosureDecision",

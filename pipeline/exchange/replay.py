@@ -53,7 +53,17 @@ def replay_agent(
 def replay_agent_of(
     data: RobotData, config: ExchangeConfig, *, seed: int, exchange_path: Path
 ) -> tuple[SessionResult, SentPackets]:
-    """`replay_agent` on data in memory."""
+    """`replay_agent` on data in memory.
+
+    Args:
+        data: of this robot.
+        config: of the run.
+        seed: of the run.
+        exchange_path: its exchange.mcap; only packets delivered to this robot are given to the agent.
+
+    Raises:
+        DuagError: it is no log of a finished session.
+    """
     determinism.configure_opencv()
     session = read_session(exchange_path)
     waiting: list[Delivery] = []

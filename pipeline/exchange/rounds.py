@@ -20,13 +20,31 @@ class Observer(Protocol[AgentSeen]):
     """Sees what happens and changes nothing."""
 
     def ticked(self, agent: AgentSeen, round_index: int, now_ns: int) -> None:
-        """An agent has computed its round."""
+        """An agent has computed its round.
+
+        Args:
+            agent: after its tick.
+            round_index: the round, from 0.
+            now_ns: its time in the session.
+        """
 
     def sent(self, sender: str, out: Outgoing, fate: Fate, *, round_index: int, now_ns: int) -> None:
-        """A packet was sent, and this became of it."""
+        """A packet was sent, and this became of it.
+
+        Args:
+            sender: name of the robot that sent it.
+            out: the packet, its receiver and its message.
+            fate: when its copies are delivered, or why it was dropped.
+            round_index: in which it was sent.
+            now_ns: time of this round in the session.
+        """
 
     def ended(self, round_index: int) -> None:
-        """All packets of a round were sent."""
+        """All packets of a round were sent.
+
+        Args:
+            round_index: the round.
+        """
 
 
 def run_rounds(
@@ -75,7 +93,15 @@ def run_rounds(
 
 
 def due(waiting: list[Delivery], now_ns: int) -> list[bytes]:
-    """Take the packets that have arrived out of a queue, by (time of delivery, sender, sequence)."""
+    """Take the packets that have arrived out of a queue, by (time of delivery, sender, sequence).
+
+    Args:
+        waiting: deliveries to one robot; those that have arrived are removed, the rest is sorted.
+        now_ns: the present time; what is delivered at this time has arrived.
+
+    Returns:
+        Bytes of the packets, in this order.
+    """
     waiting.sort(key=lambda d: d[:3])
     count = next((i for i, d in enumerate(waiting) if d[0] > now_ns), len(waiting))
     arrived = [d[3] for d in waiting[:count]]

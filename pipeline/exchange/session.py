@@ -105,7 +105,24 @@ def run_session_of(
     watch: RoundWatch | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> dict[str, SessionResult]:
-    """`run_session` on data in memory, one entry per robot."""
+    """`run_session` on data in memory, one entry per robot.
+
+    Args:
+        data: of every robot, in any order.
+        config: the same for all.
+        seed: of this run.
+        exchange_path: log of messages and packets to write.
+        consensus_path: log of rounds and loop closures to write.
+        watch: hears of every round, and changes nothing; None: nobody watches.
+        checkpoints: keep what is slow.
+
+    Returns:
+        The result of every robot, by name.
+
+    Raises:
+        DuagError: two robots have the same name, the team is too large, the settings do not fit to it, or a
+            map has numbers that are not finite.
+    """
     determinism.configure_opencv()
     agents = team_of(data, config, seed, Recall(checkpoints, "session"))
     metadata = {"config": config.model_dump_json(), "seed": str(seed)}
@@ -139,7 +156,17 @@ def run_session_of(
 def team_of(
     data: Sequence[RobotData], config: ExchangeConfig, seed: int, recall: Recalling = computed
 ) -> dict[str, MapAgent]:
-    """The agents of a team, by name, in alphabetical order; each is given its own data only."""
+    """The agents of a team, by name, in alphabetical order; each is given its own data only.
+
+    Args:
+        data: of every robot, in any order.
+        config: the same for all.
+        seed: of this run.
+        recall: slow results; they change no bit.
+
+    Raises:
+        DuagError: two robots have the same name, the team is too large, or the settings do not fit to it.
+    """
     names = sorted(d.robot for d in data)
     if len(set(names)) != len(names) or len(names) > MAX_TEAM:
         raise DuagError(f"team of {len(names)}: expected different names and at most {MAX_TEAM} robots")

@@ -23,7 +23,11 @@ from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
 
 
 def result_of(agent: MapAgent) -> SessionResult:
-    """The result of an agent. Alone, its poses are those of its own map, bit for bit."""
+    """The result of an agent. Alone, its poses are those of its own map, bit for bit.
+
+    Args:
+        agent: after its last tick.
+    """
     robot, team, knowledge = agent.data.robot, agent.team, agent.knowledge
     T_common = {robot: agent.data.T_map_keyframe}
     gauge = np.eye(4)

@@ -190,7 +190,11 @@ class Sharing:
         self.knowledge.anchors_bytes[self.own] = anchors_wire.write_anchors(self._as_sent(anchors))
 
     def complete(self, members: Sequence[int]) -> bool:
-        """Whether agreed poses, evidence and matches of all members are here."""
+        """Whether agreed poses, evidence and matches of all members are here.
+
+        Args:
+            members: indices of all of them, this robot included.
+        """
         k = self.knowledge
         return (
             all(m in k.anchors for m in members)
@@ -199,7 +203,12 @@ class Sharing:
         )
 
     def supplied(self, state: State, members: Sequence[int]) -> bool:
-        """Whether a neighbor has the evidence of all members."""
+        """Whether a neighbor has the evidence of all members.
+
+        Args:
+            state: the last one of the neighbor.
+            members: indices of the robots of the component.
+        """
         return all(state.sources[m] == state_wire.COMPLETE for m in members)
 
     # --- outgoing
@@ -314,7 +323,11 @@ class Sharing:
         return self
 
     def is_here(self, owner: int) -> bool:
-        """Whether the evidence of a robot is here."""
+        """Whether the evidence of a robot is here.
+
+        Args:
+            owner: index of the robot.
+        """
         return owner == self.own or owner in self.knowledge.evidence
 
     def matched_at(self, other: int, T_own: Array, T_other: Array) -> NDArray[np.int64] | None:
@@ -357,7 +370,11 @@ class Sharing:
         return self.team[poses.owner], records, poses.T_common_keyframe
 
     def match(self, others: Sequence[int]) -> None:
-        """Match own Gaussians with those of every higher-named member, once everything needed is here."""
+        """Match own Gaussians with those of every higher-named member, once everything needed is here.
+
+        Args:
+            others: indices of the other members.
+        """
         k = self.knowledge
         for other in others:
             ready = other in k.anchors and other in k.evidence and (self.own, other) not in k.pairs

@@ -100,7 +100,12 @@ class PoseSolver(Protocol):
         """One round of computation."""
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
-        """What goes to a neighbor in this round, never again; each fits into `room_bytes`."""
+        """What goes to a neighbor in this round, never again; each fits into `room_bytes`.
+
+        Args:
+            neighbor: the receiver.
+            room_bytes: most bytes of each part.
+        """
 
     def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
         """Use what a neighbor sent in a round.

@@ -106,7 +106,14 @@ EVIDENCE_KINDS = {
 
 
 def records_per_chunk(kind: Kind) -> int:
-    """Records in a full packet of evidence."""
+    """Records in a full packet of evidence.
+
+    Args:
+        kind: of the evidence.
+
+    Raises:
+        KeyError: it is no kind of evidence.
+    """
     return (MAX_PAYLOAD_BYTES - EVIDENCE_HEAD_BYTES) // EVIDENCE_KINDS[kind]
 
 
@@ -119,17 +126,33 @@ _CHUNK_BYTES = {
 
 
 def chunk_bytes(kind: Kind) -> int:
-    """Distance between the cuts of a message of this kind."""
+    """Distance between the cuts of a message of this kind, in bytes.
+
+    Args:
+        kind: of the message.
+    """
     return _CHUNK_BYTES[kind]
 
 
 def chunk_count(kind: Kind, total_bytes: int) -> int:
-    """Number of packets that a message of `total_bytes` needs; an empty message needs one."""
+    """Number of packets that a message needs; an empty message needs one.
+
+    Args:
+        kind: of the message.
+        total_bytes: of the message.
+    """
     return max(1, -(-total_bytes // chunk_bytes(kind)))
 
 
 def serialize(packet: Packet) -> bytes:
-    """Bytes of a packet: header, with its CRC over all else, and payload."""
+    """Bytes of a packet: header, with its CRC over all else, and payload.
+
+    Args:
+        packet: with a payload of at most `MAX_PAYLOAD_BYTES`.
+
+    Raises:
+        ValueError: the payload does not fit.
+    """
     if len(packet.payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"payload of {len(packet.payload)} bytes, at most {MAX_PAYLOAD_BYTES} fit")
     values = (
@@ -150,12 +173,19 @@ def serialize(packet: Packet) -> bytes:
 
 
 def payload_bytes(data: bytes) -> int:
-    """Length of the payload that a header announces; a signature may follow the payload."""
+    """Length of the payload that a header announces; a signature may follow the payload.
+
+    Args:
+        data: bytes of a packet, at least its header.
+    """
     return int(_FIELDS.unpack_from(data)[-1])
 
 
 def parse(data: bytes) -> Packet:
     """Read one packet.
+
+    Args:
+        data: bytes of one packet, without a signature.
 
     Raises:
         MalformedError: anything is not as `serialize` writes it; the text is the reason.

@@ -23,12 +23,22 @@ class Identity:
     """What one robot needs to sign, and to check the others: its private key and all public keys."""
 
     def __init__(self, private: Ed25519PrivateKey, public: Sequence[Ed25519PublicKey]) -> None:
-        """public: of the sorted team, by index."""
+        """Take the keys.
+
+        Args:
+            private: of this robot.
+            public: of the sorted team, by index.
+        """
         self._private, self._public = private, tuple(public)
 
     @staticmethod
     def simulated(seed: int, team: Sequence[str], own: str) -> Identity:
         """The keys that a robot of a simulated team was given before the start.
+
+        Args:
+            seed: of the run.
+            team: names of all robots, in any order.
+            own: name of this robot.
 
         Raises:
             DuagError: the package that signs is not installed.
@@ -49,12 +59,25 @@ class Identity:
         return Identity(keys[own], [keys[robot].public_key() for robot in sorted(team)])
 
     def seal(self, packet: Packet) -> bytes:
-        """Bytes of an own packet with its signature."""
+        """Bytes of an own packet with its signature.
+
+        Args:
+            packet: whose sender is this robot.
+
+        Returns:
+            Header, payload, and 64 bytes of signature.
+
+        Raises:
+            ValueError: its payload does not fit.
+        """
         data = serialize(packet)
         return data + self._private.sign(data)
 
     def open(self, sealed: bytes) -> Packet:
         """The packet, if its sender made it.
+
+        Args:
+            sealed: bytes of a packet, and then those of its signature.
 
         Raises:
             MalformedError: it is no packet, or not signed by the robot that it names as its sender.

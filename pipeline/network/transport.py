@@ -298,6 +298,9 @@ class Transport:
     def receive(self, packet: Packet, round_index: int) -> Arrival | None:
         """Take one parsed packet from this neighbor.
 
+        Args:
+            packet: from this neighbor to this robot.
+            round_index: the current round.
         Returns:
             A complete message, or a chunk of evidence not seen before; None if there is nothing to act on.
         Raises:

@@ -71,7 +71,11 @@ class Edges:
     inlier: NDArray[np.bool_] | None = None
 
     def select(self, keep: NDArray[np.bool_]) -> Edges:
-        """The edges of a mask."""
+        """The edges of a mask.
+
+        Args:
+            keep: bool [m].
+        """
         at = np.flatnonzero(keep).tolist()
         inlier = None if self.inlier is None else self.inlier[keep]
         i, j = [self.i[k] for k in at], [self.j[k] for k in at]
@@ -80,6 +84,9 @@ class Edges:
 
 def read_g2o(path: Path) -> Edges:
     """Edges of one `.g2o` file in 3-D; keys with a gtsam symbol name their robot by its character.
+
+    Args:
+        path: the file.
 
     Raises:
         DuagError: names the line that is not understood, or whose numbers nobody can compute with.
@@ -183,7 +190,15 @@ def _isotropic(upper: Array, path: Path, lines: list[int]) -> tuple[Array, Array
 
 
 def read_kimera(path: Path) -> Edges:
-    """Edges of one robot's `measurements.csv` of Kimera-Multi; `weight` and `is_known_inlier` are ignored."""
+    """Edges of one robot's `measurements.csv` of Kimera-Multi; `weight` and `is_known_inlier` are ignored.
+
+    Args:
+        path: the file.
+
+    Raises:
+        DuagError: a column is missing, or a line is not understood or has numbers that nobody can compute
+            with.
+    """
     reader = csv.DictReader(read_text(path, "a pose graph").splitlines(), skipinitialspace=True)
     missing = [name for name in KIMERA_COLUMNS if name not in (reader.fieldnames or [])]
     if missing:

@@ -20,7 +20,16 @@ _LEAST_PACKETS = 2  # per step: the other end has answered to the last weights
 
 
 def graduated_weights(squared: Array, c2: float, mu: float) -> Array:
-    """Weights of truncated least squares at control parameter mu: mu -> infinity truncates at c2."""
+    """Weights of truncated least squares at control parameter mu: mu -> infinity truncates at c2.
+
+    Args:
+        squared: [m], squared whitened residuals.
+        c2: square of the truncation.
+        mu: above zero.
+
+    Returns:
+        [m], 0 to 1.
+    """
     low, high = mu / (mu + 1) * c2, (mu + 1) / mu * c2
     between = np.sqrt(c2 * mu * (mu + 1) / np.maximum(squared, low)) - mu
     return np.where(squared <= low, 1.0, np.where(squared >= high, 0.0, between))
@@ -52,7 +61,14 @@ def convex_control(squared: Array, config: PoseConsensusConfig) -> float:
 
 
 def controls(config: PoseConsensusConfig) -> list[float]:
-    """The whole schedule of the control parameter."""
+    """The whole schedule of the control parameter.
+
+    Args:
+        config: the least and the greatest control parameter, and the factor of a step.
+
+    Returns:
+        Ascending.
+    """
     first, last = config.robust_mu
     steps = 1 + math.floor(math.log(last / first) / math.log(config.robust_growth))
     return [first * config.robust_growth**k for k in range(steps)]

@@ -44,14 +44,24 @@ SYMMETRIC: dict[str, Any] = {
 
 
 def retract(T: Array, delta: Array) -> Array:
-    """x (+) delta: poses [n, 4, 4] moved by tangents [n, 6] (translation, rotation) of the product group."""
+    """x (+) delta: poses [n, 4, 4] moved by tangents [n, 6] (translation, rotation) of the product group.
+
+    Args:
+        T: [n, 4, 4], T_world_keyframe, meters.
+        delta: [n, 6], translation in the world frame (m), rotation in the keyframe's own frame (rad).
+    """
     return se3.from_rotation_translation(
         T[..., :3, :3] @ so3.exp(delta[..., 3:]), T[..., :3, 3] + delta[..., :3]
     )
 
 
 def difference(T: Array, T_base: Array) -> Array:
-    """x (-) y: tangents [n, 6] (translation, rotation) from T_base to T on the product group."""
+    """x (-) y: tangents [n, 6] (translation, rotation) from T_base to T on the product group.
+
+    Args:
+        T: [n, 4, 4], T_world_keyframe, meters.
+        T_base: [n, 4, 4], likewise; the rotation is in its frame.
+    """
     rotation = so3.log(np.swapaxes(T_base[..., :3, :3], -1, -2) @ T[..., :3, :3])
     return np.concatenate([T[..., :3, 3] - T_base[..., :3, 3], rotation], axis=-1)
 
@@ -66,27 +76,56 @@ def _errors(factors: RelativePoses, T: Array) -> tuple[Array, Array, Array]:
 
 
 def errors(factors: RelativePoses, T: Array) -> Array:
-    """Errors e [m, 6] before whitening: meters, and twice the vector part of a quaternion."""
+    """Errors e [m, 6] before whitening: meters, and twice the vector part of a quaternion.
+
+    Args:
+        factors: m relative poses between the n variables.
+        T: [n, 4, 4], T_world_keyframe of the variables, meters.
+    """
     return _errors(factors, T)[0]
 
 
 def residuals(factors: RelativePoses, T: Array) -> Array:
-    """Whitened residuals r [m, 6], no unit, at poses T [n, 4, 4]."""
+    """Whitened residuals r [m, 6], no unit.
+
+    Args:
+        factors: m relative poses between the n variables.
+        T: [n, 4, 4], T_world_keyframe of the variables, meters.
+    """
     return (factors.whitening @ _errors(factors, T)[0][..., None])[..., 0]
 
 
 def squared_residuals(factors: RelativePoses, T: Array) -> Array:
-    """|r|^2 [m] of every factor."""
+    """|r|^2 [m] of every factor.
+
+    Args:
+        factors: m relative poses between the n variables.
+        T: [n, 4, 4], T_world_keyframe of the variables, meters.
+    """
     return np.sum(residuals(factors, T) ** 2, axis=1)
 
 
 def cost(factors: RelativePoses, T: Array, weights: ArrayLike = 1.0) -> float:
-    """Sum of weight |r|^2 (SE-Sync's F for isotropic information)."""
+    """Sum of weight |r|^2 (SE-Sync's F for isotropic information).
+
+    Args:
+        factors: m relative poses between the n variables.
+        T: [n, 4, 4], T_world_keyframe of the variables, meters.
+        weights: [m], or one for all.
+    """
     return float(np.sum(np.asarray(weights) * squared_residuals(factors, T)))
 
 
 def linearized(factors: RelativePoses, T: Array) -> tuple[Array, Array, Array]:
-    """Residuals [m, 6] and their derivatives [m, 6, 6] by the product-group tangents of poses i and j."""
+    """Residuals [m, 6] and their derivatives [m, 6, 6] by the product-group tangents of poses i and j.
+
+    Args:
+        factors: m relative poses between the n variables.
+        T: [n, 4, 4], T_world_keyframe of the variables, meters.
+
+    Returns:
+        Whitened residuals r [m, 6], dr/dxi [m, 6, 6] and dr/dxj [m, 6, 6], 1/m and 1/rad.
+    """
     e, qw, baseline = _errors(factors, T)
     Ri_t = np.swapaxes(T[factors.i, :3, :3], -1, -2)
     q_hat = so3.hat(0.5 * e[:, 3:])
@@ -101,7 +140,13 @@ def linearized(factors: RelativePoses, T: Array) -> tuple[Array, Array, Array]:
 
 
 def gradient(factors: RelativePoses, weights: Array, T: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Half the gradient J' r [n, 6] of the weighted cost, and the weighted Jacobians for `curvature_matrix`."""
+    """Half the gradient J' r [n, 6] of the weighted cost, and the weighted Jacobians for `curvature_matrix`.
+
+    Args:
+        factors: m relative poses between the n variables.
+        weights: [m], one per relative pose.
+        T: [n, 4, 4], T_world_keyframe of the variables, meters.
+    """
     r, Ji, Jj = linearized(factors, T)
     root = np.sqrt(weights)
     r, Ji, Jj = r * root[:, None], Ji * root[:, None, None], Jj * root[:, None, None]
@@ -114,7 +159,13 @@ def gradient(factors: RelativePoses, weights: Array, T: Array) -> tuple[Array, t
 def curvature_matrix(
     factors: RelativePoses, jacobians: tuple[Array, Array], diagonal: Array
 ) -> sparse.csc_matrix:
-    """Gauss-Newton matrix J' J + diag(diagonal [n, 6]), sparse [6 n, 6 n]."""
+    """Gauss-Newton matrix J' J + diag(diagonal), sparse [6 n, 6 n].
+
+    Args:
+        factors: m relative poses between the n variables.
+        jacobians: [m, 6, 6] by pose i and by pose j, weighted, from `gradient`.
+        diagonal: [n, 6], added to that of J' J, 1/m^2 and 1/rad^2.
+    """
     Ji, Jj = jacobians
     Ji_t, Jj_t = np.swapaxes(Ji, -1, -2), np.swapaxes(Jj, -1, -2)
     off = Ji_t @ Jj
@@ -138,7 +189,17 @@ def curvature_matrix(
 
 
 def factorized(H: sparse.csc_matrix) -> Callable[[Array], Array]:
-    """Solver of H x = b for a symmetric positive definite sparse H."""
+    """Solver of H x = b for a symmetric positive definite sparse H.
+
+    Args:
+        H: sparse [k, k].
+
+    Returns:
+        From b [k] or [k, c] to x of the same shape.
+
+    Raises:
+        DuagError: it is singular in its numbers.
+    """
     return decomposed(H, **SYMMETRIC).solve
 
 

@@ -38,7 +38,11 @@ class KeyframePoses:
     drift: Array
 
     def moved(self, T: Array) -> KeyframePoses:
-        """The same in another frame, to which T [4, 4] leads."""
+        """The same in another frame.
+
+        Args:
+            T: [4, 4], from the present frame to the other one.
+        """
         return KeyframePoses(T @ self.T_frame_keyframe, self.drift)
 
 
@@ -217,6 +221,12 @@ def frame_variance(
     """Variance (m^2, rad^2) of the relative frame that loop closures agree on, anywhere in the two maps.
 
     No loop closure is surer than the drift of both robots lets it be, so many are no better here than their mean.
+
+    Args:
+        closures: one at least of one pair, from the side of one end.
+        own: keyframes of this end, in any one frame.
+        peer: keyframes of the peer, in any one frame.
+        config: for the sigma floor.
     """
     mean = _whole_variance(closures, own, peer, config).mean(axis=0)
     return float(mean[0]), float(mean[1])
@@ -237,7 +247,12 @@ def _whole_variance(
 
 
 def robust_frame(frames: Array, config: LoopClosureConfig) -> Array:
-    """One motion [4, 4] from many proposals [m, 4, 4]: the best supported one, then a Cauchy-weighted mean."""
+    """One motion [4, 4] from many proposals [m, 4, 4]: the best supported one, then a Cauchy-weighted mean.
+
+    Args:
+        frames: [m, 4, 4], m > 0, meters.
+        config: scales of the Cauchy weights.
+    """
     tried = np.unique(np.linspace(0, len(frames) - 1, _CANDIDATES).round().astype(np.int64))
     support = [float(_cauchy(frames, frames[k], config).sum()) for k in tried]
     T = frames[tried[int(np.argmax(support))]]

@@ -133,7 +133,12 @@ class PoseGraph:
         return PoseGraph(first, RelativePoses.concatenate(parts), np.concatenate(weights), start)
 
     def of(self, robot: str, poses: Array) -> Array:
-        """One robot's poses [k, 4, 4] out of the team's [n, 4, 4]."""
+        """One robot's poses [k, 4, 4] out of the team's.
+
+        Args:
+            robot: its name.
+            poses: [n, 4, 4], of all variables.
+        """
         ends = sorted([*self.first.values(), len(self.T_start)])
         start = self.first[robot]
         return poses[start : ends[ends.index(start) + 1]]

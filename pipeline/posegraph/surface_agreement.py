@@ -24,7 +24,11 @@ KEYFRAMES = 24  # own keyframes that are compared with one of the neighbor's, th
 
 
 def coarse_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What is kept of a depth image [h, w] (m, 0 = unknown)."""
+    """What is kept of a depth image: every `STRIDE_PX`-th row and column.
+
+    Args:
+        depth_m: [h, w], 0 = unknown.
+    """
     return np.ascontiguousarray(depth_m[::STRIDE_PX, ::STRIDE_PX])
 
 

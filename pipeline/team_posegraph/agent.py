@@ -26,7 +26,14 @@ _UNLIMITED_BYTES = 1 << 40  # what a solver sends is counted, not held back
 
 
 def exchange_config(config: PoseGraphConfig) -> ExchangeConfig:
-    """The settings of a run on a pose graph as those of a session."""
+    """The settings of a run on a pose graph as those of a session.
+
+    Args:
+        config: solver, losses and settings of the consensus.
+
+    Returns:
+        Settings with links of no latency, no limit of bytes, and no contact that is given up.
+    """
     consensus, solver = config.consensus, config.solver
     if solver == "elimination":
         consensus = consensus.model_copy(update={"tolerance": config.elimination_tolerance})

@@ -100,6 +100,12 @@ class PrintedAdmmSolver:
     # --- packets
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
+        """Own keyframes that loop closures with a neighbor name, in float32.
+
+        Args:
+            neighbor: receiver of the packets.
+            room_bytes: most bytes of each part.
+        """
         named = np.unique([c.own_keyframe for c in neighbor.closures]).astype(np.int32)
         T = self._x[named]
         self._sent += 1
@@ -118,6 +124,15 @@ class PrintedAdmmSolver:
         return write_poses_in_parts(packet, room_bytes, decides=False)
 
     def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
+        """Use keyframes that are not older than the last ones.
+
+        Args:
+            neighbor: sender of the packet.
+            payload: some of its keyframes in the common frame, from `states`.
+
+        Raises:
+            MalformedError: it is not what it should be.
+        """
         expected = neighbor.shared.keyframes
         packet = read_poses(payload, expected, from_decider=False)
         if packet.sequence >= self._newest[neighbor.index]:
@@ -131,7 +146,12 @@ class PrintedAdmmSolver:
         return []
 
     def take_message(self, sender: int, payload: bytes) -> None:
-        """The printed iteration has no reliable messages; there is nothing to keep."""
+        """The printed iteration has no reliable messages; there is nothing to keep.
+
+        Args:
+            sender: index of the neighbor.
+            payload: not read.
+        """
 
     # --- results
 
@@ -154,7 +174,14 @@ class PrintedAdmmSolver:
         return self._step
 
     def weights(self, peer: str) -> Array:
-        """The printed iteration has no robust weights: everything counts."""
+        """The printed iteration has no robust weights: everything counts.
+
+        Args:
+            peer: name of the neighbor.
+
+        Returns:
+            [m], all one.
+        """
         return self._weights[peer].copy()
 
     @property
@@ -162,7 +189,11 @@ class PrintedAdmmSolver:
         return np.ones(self._loops)
 
     def refuted(self, peer: str) -> bool:
-        """Never."""
+        """Never.
+
+        Args:
+            peer: name of the neighbor.
+        """
         return False
 
     def residuals(self) -> dict[str, Any]:

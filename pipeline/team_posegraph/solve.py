@@ -69,7 +69,18 @@ class _Component:
 def solve(
     path: Path, config: PoseGraphConfig, robots: int | None = None, *, only_reference: bool = False
 ) -> dict[str, Any]:
-    """Read, cut, let the team solve it, compare; see `docs/howto/pose-graph.md` for the result."""
+    """Read, cut, let the team solve it, compare; see `docs/howto/pose-graph.md` for the result.
+
+    Args:
+        path: a graph, or a folder of a team's graphs, as `read_team_graph` takes it.
+        config: the same at all robots.
+        robots: cut a single graph among so many, 4 if None; for a team's own files, at most a check.
+        only_reference: leave out loops and loop closures that the reference next to the graph does not name
+            as true.
+
+    Raises:
+        DuagError: the graph cannot be read or solved for, or has too many robots.
+    """
     graph = read_team_graph(path, robots, only_reference=only_reference)
     if len(graph.robots) > MAX_TEAM:
         raise DuagError(f"{path}: found {len(graph.robots)} robots, expected at most {MAX_TEAM}")

@@ -6,7 +6,11 @@ from typing import Any
 
 
 def format_result(result: dict[str, Any]) -> str:
-    """Some lines of text."""
+    """Some lines of text.
+
+    Args:
+        result: of `solve`.
+    """
     r = result
     robust = "robust weights" if r["robust"] == "gnc" else "every factor counts"
     lines = [

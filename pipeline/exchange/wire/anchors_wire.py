@@ -42,7 +42,15 @@ _HEAD = struct.Struct("<HI")
 
 
 def write_anchors(anchors: Anchors) -> bytes:
-    """Bytes of ANCHORS."""
+    """Bytes of ANCHORS.
+
+    Args:
+        anchors: poses of one robot, n keyframes at least one.
+
+    Returns:
+        Owner, number of keyframes, camera, first keyframe in the map, and the upper rows of all poses in
+        float64.
+    """
     return b"".join(
         [
             _HEAD.pack(anchors.owner, len(anchors.T_common_keyframe)),
@@ -54,7 +62,15 @@ def write_anchors(anchors: Anchors) -> bytes:
 
 
 def read_anchors(data: bytes, team: int) -> Anchors:
-    """From ANCHORS."""
+    """From ANCHORS.
+
+    Args:
+        data: of the message.
+        team: number of robots.
+
+    Raises:
+        MalformedError: it is not what it should be, or of a robot outside the team.
+    """
     reader = Reader(data, "anchors")
     owner, n = reader.fields(_HEAD)
     if owner >= team or not 1 <= n <= MAX_KEYFRAMES:

@@ -17,12 +17,19 @@ LEAST_FOCAL = 0.1
 
 
 def camera_bytes(camera: PinholeCamera) -> bytes:
-    """Bytes of a camera: 36."""
+    """Bytes of a camera: 36.
+
+    Args:
+        camera: pinhole; its size in px, focal lengths and principal point in px.
+    """
     return _CAMERA.pack(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def read_camera(reader: Reader) -> PinholeCamera:
     """The camera that comes next.
+
+    Args:
+        reader: stands before the 36 bytes; it then stands after them.
 
     Raises:
         MalformedError: no camera is like that.

@@ -58,6 +58,12 @@ _MISSED = 1e-3  # of the largest entry: by so much a product may differ from its
 def encode(records: NDArray[Any]) -> NDArray[Any]:
     """Compact records [n] of records [n] as `evidence_wire.RECORD`.
 
+    Args:
+        records: [n], theta [13] and information [31] in the frames of the anchors, means in meters.
+
+    Returns:
+        [n] of `COMPACT`, rounded to its steps.
+
     Raises:
         ValueError: an id beyond 32 bits or an anchor beyond 16; no map of this project has them.
     """
@@ -83,7 +89,15 @@ def encode(records: NDArray[Any]) -> NDArray[Any]:
 
 
 def decode(compact: NDArray[Any], record: np.dtype[Any]) -> NDArray[Any]:
-    """Records of dtype `record` (`evidence_wire.RECORD`) from compact ones."""
+    """Records of dtype `record` (`evidence_wire.RECORD`) from compact ones.
+
+    Args:
+        compact: [n] of `COMPACT`.
+        record: dtype of the result.
+
+    Returns:
+        [n] of `record`, in the same order and frames.
+    """
     out = np.zeros(len(compact), record)
     out["id"], out["anchor"] = compact["id"], compact["anchor"]
     out["theta"][:, MEAN] = compact["mean"]

@@ -53,7 +53,11 @@ class AnswerPart:
 
 
 def write_graphs(parts: Mapping[int, GraphPart]) -> bytes:
-    """Bytes of the graphs of some robots, by index."""
+    """Bytes of the graphs of some robots, by index.
+
+    Args:
+        parts: by index of the robot.
+    """
     out = [_HEAD.pack(GRAPHS, len(parts))]
     for index, part in sorted(parts.items()):
         counts = len(part.T_world_keyframe), len(part.trusted), len(part.loops), len(part.closures)
@@ -72,6 +76,13 @@ def write_graphs(parts: Mapping[int, GraphPart]) -> bytes:
 
 def read_graphs(payload: bytes, team: int) -> dict[int, GraphPart]:
     """The graphs of some robots.
+
+    Args:
+        payload: of the message.
+        team: number of robots.
+
+    Returns:
+        The graphs by index of the robot.
 
     Raises:
         MalformedError: it is not what it should be.
@@ -98,7 +109,11 @@ def read_graphs(payload: bytes, team: int) -> dict[int, GraphPart]:
 
 
 def write_answer(parts: Mapping[int, AnswerPart]) -> bytes:
-    """Bytes of the answer for some robots, by index."""
+    """Bytes of the answer for some robots, by index.
+
+    Args:
+        parts: by index of the robot.
+    """
     out = [_HEAD.pack(ANSWER, len(parts))]
     for index, part in sorted(parts.items()):
         sizes = len(part.T_world_keyframe), len(part.loop_weights), len(part.closure_weights)
@@ -111,6 +126,12 @@ def write_answer(parts: Mapping[int, AnswerPart]) -> bytes:
 
 def read_answer(payload: bytes) -> dict[int, AnswerPart]:
     """The answer for some robots.
+
+    Args:
+        payload: of the message.
+
+    Returns:
+        The answer by index of the robot.
 
     Raises:
         MalformedError: it is not what it should be.

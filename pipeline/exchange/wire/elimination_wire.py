@@ -24,7 +24,12 @@ class Code(IntEnum):
 
 
 def write_message(message: Message, precision: str) -> bytes:
-    """Bytes of a message; precision: of matrices."""
+    """Bytes of a message.
+
+    Args:
+        message: a front, a block with its exchange, or a step.
+        precision: of matrices, float32 or float64.
+    """
     if isinstance(message, BackSubstitution):
         return write_step(message)
     if isinstance(message, tuple):
@@ -36,6 +41,11 @@ def take_messages(
     node: TreeNode, arrived: list[tuple[int, bytes]], team: int
 ) -> tuple[list[tuple[int, bytes]], list[str]]:
     """Hand messages, each with its sender, to a node.
+
+    Args:
+        node: gets them; it computes only when it advances.
+        arrived: index of the sender, and the payload.
+        team: number of robots.
 
     Returns:
         Those that came too early (a block before its front: losses change the order), and why others were refused.
@@ -74,7 +84,11 @@ LARGEST = 1e30  # of a matrix, a gradient or a step: sums and products of such n
 
 
 def write_front(variables: Mapping[Variable, int]) -> bytes:
-    """Bytes of FRONT, 14 per variable: owner, keyframe, mask of all robots that have it (0: owner not below)."""
+    """Bytes of FRONT, 14 per variable: owner, keyframe, mask of all robots that have it (0: owner not below).
+
+    Args:
+        variables: mask of robots by (owner, keyframe).
+    """
     names = sorted(variables)
     return b"".join(
         [
@@ -87,7 +101,18 @@ def write_front(variables: Mapping[Variable, int]) -> bytes:
 
 
 def read_front(data: bytes, team: int) -> dict[Variable, int]:
-    """From FRONT."""
+    """From FRONT.
+
+    Args:
+        data: of the message.
+        team: number of robots.
+
+    Returns:
+        Mask of robots by (owner, keyframe), ascending.
+
+    Raises:
+        MalformedError: it is not what it should be, or names a robot outside the team.
+    """
     reader = Reader(data, "front")
     _, n = reader.fields(_FRONT)
     owners = reader.array("uint16", (n,)).tolist()
@@ -105,7 +130,12 @@ def read_front(data: bytes, team: int) -> dict[Variable, int]:
 def write_block(exchange: int, block: Block, precision: str) -> bytes:
     """Bytes of BLOCK. Of H the upper triangle, and of its 6x6 parts others the diagonal those that are not zero.
 
-    precision: float32 or float64, of H; the gradient, which decides where the iteration ends, is always float64.
+    The gradient, which decides where the iteration ends, is always float64.
+
+    Args:
+        exchange: number of the exchange.
+        block: quadratic form over b variables, tangents (translation, rotation) in m and rad.
+        precision: of H, float32 or float64.
     """
     n = len(block.g) // 6
     flags = _REWEIGHTED * block.reweighted + _UNSURE * block.unsure + _DOUBLE * (precision == "float64")
@@ -129,7 +159,15 @@ def write_block(exchange: int, block: Block, precision: str) -> bytes:
 
 
 def read_block(data: bytes, variables: int) -> tuple[int, Block]:
-    """Number of the exchange and the block, over so many variables."""
+    """Number of the exchange and the block, over so many variables.
+
+    Args:
+        data: of the message.
+        variables: how many it must be about.
+
+    Raises:
+        MalformedError: it is not what it should be, or over another number of variables.
+    """
     reader = Reader(data, "block")
     _, exchange, n, cost, largest_step, flags = reader.fields(_BLOCK)
     possible = 0 <= cost < np.inf and 0 <= largest_step < np.inf
@@ -164,14 +202,27 @@ def _read_matrix(reader: Reader, n: int, precision: str) -> Array:
 
 
 def write_step(step: BackSubstitution) -> bytes:
-    """Bytes of STEP: 48 per shared variable."""
+    """Bytes of STEP: 48 per shared variable.
+
+    Args:
+        step: of s shared variables, tangents (translation, rotation) in m and rad; none if it was not
+            accepted.
+    """
     flags = _ACCEPTED * step.accepted + _FINISHED * step.finished + _FRESH * step.fresh
     head = _STEP.pack(Code.STEP, step.exchange, flags, step.damping, len(step.delta))
     return head + array_bytes(step.delta, "float64")
 
 
 def read_step(data: bytes, variables: int) -> BackSubstitution:
-    """From STEP over so many variables; without steps if it was not accepted."""
+    """From STEP over so many variables; without steps if it was not accepted.
+
+    Args:
+        data: of the message.
+        variables: how many it must be about if it was accepted.
+
+    Raises:
+        MalformedError: it is not what it should be, or over another number of variables.
+    """
     reader = Reader(data, "step")
     _, exchange, flags, damping, n = reader.fields(_STEP)
     delta = reader.array("float64", (n, 6))

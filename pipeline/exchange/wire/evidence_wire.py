@@ -59,12 +59,27 @@ assert _EVIDENCE.size == EVIDENCE_HEAD_BYTES
 
 
 def record_dtype(kind: Kind) -> np.dtype[Any]:
-    """Records as they are made and read for this kind of evidence."""
+    """Records as they are made and read for this kind of evidence.
+
+    Args:
+        kind: of the evidence; EVIDENCE_DOUBLE has float64, the others float32.
+    """
     return RECORD_DOUBLE if kind is Kind.EVIDENCE_DOUBLE else RECORD
 
 
 def to_body(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
-    """Records as a packet of this kind has them. Rounding happens here, once: a body is passed on unchanged."""
+    """Records as a packet of this kind has them. Rounding happens here, once: a body is passed on unchanged.
+
+    Args:
+        kind: of the evidence.
+        records: [n] of `record_dtype(kind)`.
+
+    Returns:
+        [n] of `COMPACT` for EVIDENCE; otherwise of the same dtype.
+
+    Raises:
+        ValueError: an id or an anchor is beyond what the compact kind holds.
+    """
     return in_blocks(encode if kind is Kind.EVIDENCE else _possible, records)
 
 
@@ -85,14 +100,26 @@ def _possible(records: NDArray[Any]) -> NDArray[Any]:
 
 
 def from_body(kind: Kind, body: NDArray[Any]) -> NDArray[Any]:
-    """Records as every receiver reads them."""
+    """Records as every receiver reads them.
+
+    Args:
+        kind: of the evidence.
+        body: [n], from `to_body`.
+
+    Returns:
+        [n] of `record_dtype(kind)`.
+    """
     return in_blocks(partial(decode, record=RECORD), body) if kind is Kind.EVIDENCE else body
 
 
 def write_evidence(kind: Kind, owner: int, depth: DepthKind, body: NDArray[Any]) -> bytes:
     """Bytes of evidence of any kind: chunks of whole records, each with its own head, as they are cut.
 
-    depth: of a Gaussian at a pixel, as the owner's map was made.
+    Args:
+        kind: of the evidence.
+        owner: index of the robot whose evidence it is.
+        depth: of a Gaussian at a pixel, as the owner's map was made.
+        body: [n], from `to_body`; n may be 0.
     """
     n, per, size = len(body), records_per_chunk(kind), body.itemsize
     head = _EVIDENCE.pack(owner, 1 + DEPTH_KINDS.index(depth), n)
@@ -106,7 +133,16 @@ def write_evidence(kind: Kind, owner: int, depth: DepthKind, body: NDArray[Any])
 
 
 def read_evidence_head(kind: Kind, chunk: bytes, team: int) -> tuple[int, DepthKind, int]:
-    """Owner of a chunk of evidence, the depth its map was made with, and the number of records of the whole message."""
+    """Owner of a chunk of evidence, the depth its map was made with, and the number of records of the whole message.
+
+    Args:
+        kind: of the evidence.
+        chunk: whole, or its first `EVIDENCE_HEAD_BYTES` bytes.
+        team: number of robots.
+
+    Raises:
+        MalformedError: it is not what it should be, or of a robot outside the team.
+    """
     owner, depth, n = Reader(chunk[:EVIDENCE_HEAD_BYTES], "evidence").fields(_EVIDENCE)
     if owner >= team or (len(chunk) - EVIDENCE_HEAD_BYTES) % EVIDENCE_KINDS[kind]:
         raise MalformedError("evidence: names a robot outside the team, or holds a part of a record")
@@ -119,6 +155,17 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
     """Owner, body and records of any number of consecutive chunks of one message, each id once.
 
     A complete message has the announced number of records; parts of one have fewer.
+
+    Args:
+        kind: of the evidence.
+        data: the chunks, one after the other.
+        team: number of robots.
+
+    Returns:
+        Index of the owner; [n] as they were sent; [n] of `record_dtype(kind)`.
+
+    Raises:
+        MalformedError: it is not what it should be, or of a robot outside the team.
     """
     owner, _, announced = read_evidence_head(kind, data[:EVIDENCE_HEAD_BYTES], team)
     step = chunk_bytes(kind)
@@ -144,7 +191,14 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
 
 
 def check_evidence(records: NDArray[Any]) -> None:
-    """Refuse records with impossible numbers. Raises MalformedError."""
+    """Refuse records with impossible numbers.
+
+    Args:
+        records: [n] of `record_dtype`, one owner's.
+
+    Raises:
+        MalformedError: a mean or size is impossible, a keyframe negative, or an id there twice.
+    """
     theta = records["theta"]
     if len(records) and (
         np.abs(theta).max() > MAX_COORDINATE or np.abs(theta[:, LOG_COVARIANCE]).max() > MAX_LOG_COVARIANCE
@@ -157,7 +211,10 @@ def check_evidence(records: NDArray[Any]) -> None:
 
 
 def check_information(information: Array) -> None:
-    """Refuse information [n, 31] that no measurement can give: indefinite, or beyond all sensors.
+    """Refuse information that no measurement can give: indefinite, or beyond all sensors.
+
+    Args:
+        information: [n, 31], laid out as in `splat.information`; position in 1/m^2.
 
     Raises:
         MalformedError: with the reason.

@@ -27,7 +27,14 @@ LEAST_METRIC = 1e-12  # 1/m^2: a deviation as large as the largest coordinate
 
 
 def read_digest(data: bytes) -> bytes:
-    """From HELLO."""
+    """From HELLO.
+
+    Args:
+        data: of the message.
+
+    Raises:
+        MalformedError: it has another length.
+    """
     if len(data) != DIGEST_BYTES:
         raise MalformedError(f"hello: {len(data)} bytes, expected {DIGEST_BYTES}")
     return data
@@ -54,7 +61,11 @@ _COUNT = struct.Struct("<I")
 
 
 def write_descriptors(own: DescriptorSet) -> bytes:
-    """Bytes of DESCRIPTORS."""
+    """Bytes of DESCRIPTORS.
+
+    Args:
+        own: of all own keyframes.
+    """
     return b"".join(
         [
             _COUNT.pack(len(own.descriptors)),
@@ -68,7 +79,14 @@ def write_descriptors(own: DescriptorSet) -> bytes:
 
 
 def read_descriptors(data: bytes) -> DescriptorSet:
-    """From DESCRIPTORS."""
+    """From DESCRIPTORS.
+
+    Args:
+        data: of the message.
+
+    Raises:
+        MalformedError: it is not what it should be.
+    """
     reader = Reader(data, "descriptors")
     n, camera = _keyframe_count(reader), read_camera(reader)
     T, drift = reader.poses(n), reader.array("float64", (n, 2))
@@ -88,12 +106,24 @@ def _keyframe_count(reader: Reader) -> int:
 
 
 def write_indices(indices: list[int]) -> bytes:
-    """Bytes of REQUEST and RECTIFIED_REQUEST: keyframe indices."""
+    """Bytes of REQUEST and RECTIFIED_REQUEST: keyframe indices.
+
+    Args:
+        indices: ascending.
+    """
     return array_bytes(indices, "uint32")
 
 
 def read_indices(data: bytes, limit: int) -> list[int]:
-    """From REQUEST and RECTIFIED_REQUEST: ascending keyframe indices below `limit`."""
+    """From REQUEST and RECTIFIED_REQUEST: ascending keyframe indices below `limit`.
+
+    Args:
+        data: of the message.
+        limit: number of keyframes of the receiver.
+
+    Raises:
+        MalformedError: it is not what it should be.
+    """
     if len(data) % 4:
         raise MalformedError("request: not a list of indices")
     indices = Reader(data, "request").array("uint32", (len(data) // 4,)).tolist()
@@ -128,7 +158,11 @@ _VERDICTS = struct.Struct("<IIIBI")
 
 
 def write_verdicts(verdicts: Verdicts) -> bytes:
-    """Bytes of CLOSURES."""
+    """Bytes of CLOSURES.
+
+    Args:
+        verdicts: the verdict on a pair of robots.
+    """
     n = len(verdicts.shared.keyframes)
     head = (verdicts.candidates, verdicts.verified, verdicts.consistent, verdicts.joined, n)
     return b"".join(
@@ -141,7 +175,15 @@ def write_verdicts(verdicts: Verdicts) -> bytes:
 
 
 def read_verdicts(data: bytes, limit: int) -> Verdicts:
-    """From CLOSURES about keyframes below `limit`."""
+    """From CLOSURES about keyframes below `limit`.
+
+    Args:
+        data: of the message.
+        limit: number of keyframes of the receiver.
+
+    Raises:
+        MalformedError: it is not what it should be.
+    """
     reader = Reader(data, "closures")
     candidates, verified, consistent, joined, n = reader.fields(_VERDICTS)
     if joined > 1 or bool(joined) != bool(n) or n > MAX_KEYFRAMES:
@@ -174,7 +216,12 @@ class NamedKeyframes:
 
 
 def write_keyframes(named: NamedKeyframes, precision: str) -> bytes:
-    """Bytes of KEYFRAMES: 40 per keyframe with poses in float32, 68 in float64."""
+    """Bytes of KEYFRAMES: 40 per keyframe with poses in float32, 68 in float64.
+
+    Args:
+        named: some own keyframes.
+        precision: of the poses, float32 or float64.
+    """
     return b"".join(
         [
             _COUNT.pack(len(named.keyframes)),
@@ -186,7 +233,16 @@ def write_keyframes(named: NamedKeyframes, precision: str) -> bytes:
 
 
 def read_keyframes(data: bytes, expected: NDArray[np.int32], precision: str) -> NamedKeyframes:
-    """From KEYFRAMES about exactly the keyframes that the loop closures name."""
+    """From KEYFRAMES about exactly the keyframes that the loop closures name.
+
+    Args:
+        data: of the message.
+        expected: int32 [s], indices of these keyframes, ascending.
+        precision: of the poses, float32 or float64.
+
+    Raises:
+        MalformedError: it is not what it should be.
+    """
     reader = Reader(data, "keyframes")
     (n,) = reader.fields(_COUNT)
     if n != len(expected):
@@ -223,7 +279,11 @@ _INT16 = 32767
 
 
 def write_sample(sample: KeyframeSample) -> bytes:
-    """Bytes of SAMPLE; points in steps of the largest coordinate / 32767, normals in bytes, gray in bytes."""
+    """Bytes of SAMPLE; points in steps of the largest coordinate / 32767, normals in bytes, gray in bytes.
+
+    Args:
+        sample: of one own keyframe; points in meters, camera frame.
+    """
     levels = sample.reference.levels
     feature_scale, feature_points = _shorts(sample.features.points)
     sample_scale, sample_points = _shorts(levels[0].points)
@@ -247,7 +307,15 @@ def write_sample(sample: KeyframeSample) -> bytes:
 
 
 def read_sample(data: bytes, limit: int) -> KeyframeSample:
-    """From SAMPLE of a keyframe below `limit`."""
+    """From SAMPLE of a keyframe below `limit`.
+
+    Args:
+        data: of the message.
+        limit: number of keyframes of the sender.
+
+    Raises:
+        MalformedError: it is not what it should be.
+    """
     reader = Reader(data, "sample")
     keyframe, n, feature_scale, m, levels, sample_scale = reader.fields(_SAMPLE)
     if keyframe >= limit:
@@ -284,7 +352,11 @@ _RECTIFIED = struct.Struct("<IHf")
 
 
 def write_rectified(rectified: RectifiedFeatures) -> bytes:
-    """Bytes of RECTIFIED; points as in SAMPLE."""
+    """Bytes of RECTIFIED; points as in SAMPLE.
+
+    Args:
+        rectified: of one own keyframe; points in meters, camera frame.
+    """
     features = rectified.features
     scale, points = _shorts(features.points)
     head = _RECTIFIED.pack(rectified.keyframe, len(features), scale)
@@ -292,7 +364,15 @@ def write_rectified(rectified: RectifiedFeatures) -> bytes:
 
 
 def read_rectified(data: bytes, limit: int) -> RectifiedFeatures:
-    """From RECTIFIED of a keyframe below `limit`."""
+    """From RECTIFIED of a keyframe below `limit`.
+
+    Args:
+        data: of the message.
+        limit: number of keyframes of the sender.
+
+    Raises:
+        MalformedError: it is not what it should be.
+    """
     reader = Reader(data, "rectified")
     keyframe, n, scale = reader.fields(_RECTIFIED)
     if keyframe >= limit or not 0 <= scale < 1:

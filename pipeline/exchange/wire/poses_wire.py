@@ -23,10 +23,16 @@ _OTHERS = np.array(
 
 
 def write_poses(packet: PosePacket, first: int, count: int, decides: bool) -> bytes:
-    """Bytes of some of the poses of a round: shared keyframes `first` to `first + count` of the link.
+    """Bytes of some of the poses of a round.
 
     The largest component of the quaternion is left out, which one takes two bits; both ends know the keyframes. The
     end that decides sends its penalties, the other end its curvature.
+
+    Args:
+        packet: all poses of the round.
+        first: place of the first one among the shared keyframes of the link.
+        count: how many follow from there.
+        decides: whether this end decides on penalties.
     """
     part = packet.part(slice(first, first + count))
     precision = _precision(part)
@@ -81,7 +87,13 @@ def _read_fixed(reader: Reader, n: int) -> NDArray[np.float64]:
 
 
 def write_poses_in_parts(packet: PosePacket, room_bytes: int, decides: bool) -> list[bytes]:
-    """All poses of a round in parts of equal size, each useful alone, that fit into `room_bytes`."""
+    """All poses of a round in parts of equal size, each useful alone.
+
+    Args:
+        packet: all poses of the round, [s] shared keyframes.
+        room_bytes: most bytes of a part.
+        decides: whether this end decides on penalties.
+    """
     n = len(packet.keyframes)
     parts = -(-n // poses_per_packet(room_bytes, _precision(packet)))
     cuts = [n * k // parts for k in range(parts + 1)]
@@ -89,12 +101,26 @@ def write_poses_in_parts(packet: PosePacket, room_bytes: int, decides: bool) -> 
 
 
 def poses_per_packet(room_bytes: int, precision: int) -> int:
-    """Poses of a precision (flag) that fit into a packet."""
+    """Poses that fit into a packet.
+
+    Args:
+        room_bytes: most bytes of the packet.
+        precision: flag of the numbers of the packet; 0 for float32, 8 for float64, 16 for steps of `STEP_M`.
+    """
     return 4 * (room_bytes - _POSES.size) // (1 + 4 * _NUMBERS[precision])
 
 
 def read_poses(data: bytes, shared: NDArray[np.int32], from_decider: bool) -> PosePacket:
-    """Poses of a round about some of the keyframes `shared`."""
+    """Poses of a round about some of the shared keyframes.
+
+    Args:
+        data: of the packet.
+        shared: int32 [s], indices of the keyframes that the link shares, ascending.
+        from_decider: whether the other end decides on penalties.
+
+    Raises:
+        MalformedError: it is not what it should be, not from this end, or of keyframes that are not shared.
+    """
     reader = Reader(data, "poses")
     sequence, version, flags, first, n, *numbers = reader.fields(_POSES)
     precision = flags & (_POSE_DOUBLE | _POSE_FIXED)
@@ -141,7 +167,12 @@ _VERSION = struct.Struct("<I")
 
 
 def write_mask(version: int, active: NDArray[np.bool_]) -> bytes:
-    """Bytes of a mask of the shared keyframes [s]: its version, then one bit each."""
+    """Bytes of a mask of the shared keyframes [s]: its version, then one bit each.
+
+    Args:
+        version: of the mask; a later one replaces an earlier one.
+        active: bool [s], shared keyframes that loop closures with weight name.
+    """
     return _VERSION.pack(version) + np.packbits(active, bitorder="little").tobytes()
 
 

@@ -36,7 +36,14 @@ class Reader:
         return layout.unpack(self._take(layout.size))
 
     def array(self, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """An array in C order; floats must be finite."""
+        """An array in C order; floats must be finite.
+
+        Args:
+            dtype: of the numbers, as numpy names it.
+            shape: of the array.
+        Raises:
+            MalformedError: there are too few bytes, or a float is not finite.
+        """
         kind = np.dtype(dtype).newbyteorder("<")
         count = 1
         for n in shape:
@@ -47,7 +54,11 @@ class Reader:
         return values
 
     def poses(self, n: int) -> Array:
-        """Motions [n, 4, 4] from their upper rows, float64."""
+        """Motions [n, 4, 4] from their upper rows, float64.
+
+        Args:
+            n: how many there must be.
+        """
         rows = self.array("float64", (n, 3, 4))  # first: n is checked against the bytes that are there
         T = np.tile(np.eye(4), (n, 1, 1))
         T[:, :3] = rows
@@ -60,7 +71,12 @@ class Reader:
         return T
 
     def motions(self, n: int, precision: str) -> Array:
-        """Motions [n, 4, 4] from quaternions and translations, all quaternions first."""
+        """Motions [n, 4, 4] from quaternions and translations, all quaternions first.
+
+        Args:
+            n: how many there must be.
+            precision: of the numbers, float32 or float64.
+        """
         quats_wxyz = self.array(precision, (n, 4)).astype(np.float64)
         translations = self.array(precision, (n, 3)).astype(np.float64)
         off = np.abs((quats_wxyz**2).sum(axis=1) - 1).max(initial=0.0)
@@ -87,7 +103,12 @@ def pose_bytes(T: Array) -> bytes:
 
 
 def motion_bytes(T: Array, precision: str) -> bytes:
-    """Motions [n, 4, 4] as quaternions and translations, all quaternions first."""
+    """Motions [n, 4, 4] as quaternions and translations, all quaternions first.
+
+    Args:
+        T: [n, 4, 4], meters.
+        precision: of the numbers, float32 or float64.
+    """
     return array_bytes(so3.to_quat_wxyz(T[:, :3, :3]), precision) + array_bytes(T[:, :3, 3], precision)
 
 
@@ -127,7 +148,12 @@ _AGREED, _DONE, _SHORT, _REVOKED = 1, 2, 4, 8  # flags
 
 
 def pair_bit(a: int, b: int) -> int:
-    """The bit of a pair of robots, by index, in a mask over all pairs."""
+    """The bit of a pair of robots, by index, in a mask over all pairs.
+
+    Args:
+        a: index of one robot in the sorted team.
+        b: index of the other one.
+    """
     lower, higher = min(a, b), max(a, b)
     return 1 << (higher * (higher - 1) // 2 + lower)
 
@@ -167,7 +193,12 @@ def write_state(state: State, *, short: bool = False) -> bytes:
 
 
 def read_state(data: bytes, team: int) -> tuple[State, bytes]:
-    """A state and the bytes that follow it."""
+    """A state and the bytes that follow it.
+
+    Args:
+        data: of the message.
+        team: number of robots.
+    """
     reader = Reader(data, "state")
     if len(data) > 2 and data[2] & _SHORT:
         alignment_hops, converged_hops, flags = reader.fields(_SHORT_STATE)
@@ -202,7 +233,12 @@ def write_labeled(revoked: int, team: int, payload: bytes) -> bytes:
 
 
 def read_labeled(data: bytes, team: int) -> tuple[int, bytes]:
-    """From TREE: the revoked links, and the message."""
+    """From TREE: the revoked links, and the message.
+
+    Args:
+        data: of the message.
+        team: number of robots.
+    """
     reader = Reader(data, "elimination")
     return _read_pairs(reader, team), data[reader.position :]
 
@@ -253,7 +289,12 @@ def write_relative_frames(frames: RelativeFrames, *, short: bool = False) -> byt
 
 
 def read_relative_frames(data: bytes, team: int) -> RelativeFrames:
-    """From RELATIVE_FRAME."""
+    """From RELATIVE_FRAME.
+
+    Args:
+        data: of the message.
+        team: number of robots.
+    """
     reader = Reader(data, "relative frame")
     lower, higher, count = reader.fields(_FRAME)
     n, short = count % _SHORT_PROPOSALS, count >= _SHORT_PROPOSALS
@@ -279,7 +320,12 @@ _OWNER = struct.Struct("<HI")
 
 
 def write_voxels(owner: int, keys: NDArray[np.int64]) -> bytes:
-    """Bytes of VOXELS: ascending keys of the voxels that `owner` saw, differences in LEB128."""
+    """Bytes of VOXELS: ascending keys of the voxels that `owner` saw, differences in LEB128.
+
+    Args:
+        owner: index of the robot.
+        keys: [n], from `evidence_records.seen_voxels`.
+    """
     out = bytearray(_OWNER.pack(owner, len(keys)))
     for step in np.diff(keys, prepend=np.int64(0)).tolist():
         while step > 127:
@@ -290,7 +336,12 @@ def write_voxels(owner: int, keys: NDArray[np.int64]) -> bytes:
 
 
 def read_voxels(data: bytes, team: int) -> tuple[int, NDArray[np.int64]]:
-    """From VOXELS: owner and ascending keys."""
+    """From VOXELS: owner and ascending keys.
+
+    Args:
+        data: of the message.
+        team: number of robots.
+    """
     reader = Reader(data, "voxels")
     owner, n = reader.fields(_OWNER)
     values = np.frombuffer(data, np.uint8, offset=_OWNER.size).astype(np.int64)
