@@ -130,7 +130,14 @@ def _options_of_file(path: Path | None, module: ModuleType, dataset: str) -> Ite
 
 
 def parse_options(options: Sequence[str]) -> dict[str, Any]:
-    """Options by name. options: `name=value`, values in TOML notation; what is none is text."""
+    """Options by name.
+
+    Args:
+        options: `name=value`, values in TOML notation; what is none is text.
+
+    Raises:
+        DuagError: an option has no name or no value, or its value is too long or nested too deep.
+    """
     values: dict[str, Any] = {}
     for option in options:
         name, separator, text = option.partition("=")

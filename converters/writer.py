@@ -58,7 +58,14 @@ UNITS = {"time": "ns", "length": "m", "depth": "depth_scale_m per unit, along z,
 
 
 def robot_names(count: int) -> list[str]:
-    """The first names of the spelling alphabet: alpha, bravo, charlie, ..."""
+    """The first names of the spelling alphabet: alpha, bravo, charlie, ...
+
+    Args:
+        count: how many.
+
+    Raises:
+        DuagError: there are fewer than one, or more than names.
+    """
     if not 1 <= count <= len(ROBOT_NAMES):
         raise DuagError(f"{count} robots, expected 1 to {len(ROBOT_NAMES)}")
     return list(ROBOT_NAMES[:count])

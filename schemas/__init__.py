@@ -43,7 +43,10 @@ def _own_pool() -> descriptor_pool.DescriptorPool:
 
 @cache
 def message_class(schema: str) -> type[Message]:
-    """The class of a schema by its full name, for example "duagc.v1.Odometry" or "foxglove.RawImage".
+    """The class of a schema.
+
+    Args:
+        schema: its full name, for example "duagc.v1.Odometry" or "foxglove.RawImage".
 
     Raises:
         KeyError: no such schema here.
@@ -60,18 +63,42 @@ def message_class(schema: str) -> type[Message]:
 
 
 def message_class_from(schema: str, descriptor_set: bytes) -> type[Message]:
-    """The class of a schema described by a serialized FileDescriptorSet, as a log carries it."""
+    """The class of a schema that a log describes.
+
+    Args:
+        schema: its full name.
+        descriptor_set: serialized FileDescriptorSet, as the log carries it.
+
+    Raises:
+        KeyError: the set does not have the schema.
+    """
     return message_factory.GetMessageClass(_pool_of(descriptor_set).FindMessageTypeByName(schema))
 
 
 def new(schema: str, **fields: Any) -> Any:
-    """A message of a schema named without its package ("Odometry"), with some fields set."""
+    """A message with some fields set.
+
+    Args:
+        schema: its name without the package, such as "Odometry".
+        fields: values by field; the others have protobuf's defaults.
+
+    Raises:
+        KeyError: there is no such schema here.
+        ValueError: it has no such field.
+    """
     return message_class(f"{PACKAGE}.{schema}")(**fields)
 
 
 @cache
 def descriptor_set(schema: str) -> bytes:
-    """Serialized FileDescriptorSet of a schema's file and all it imports, imports first; the same bytes always."""
+    """Serialized FileDescriptorSet of a schema's file and all it imports, imports first; always the same.
+
+    Args:
+        schema: its full name.
+
+    Raises:
+        KeyError: there is no such schema here.
+    """
     out = descriptor_pb2.FileDescriptorSet()
     seen: set[str] = set()
 

@@ -33,7 +33,11 @@ class Topic:
     meaning: str
 
     def of(self, robot: str) -> str:
-        """The topic of one robot, for example "/alpha/odometry"."""
+        """The topic of one robot, for example "/alpha/odometry".
+
+        Args:
+            robot: its name.
+        """
         return self.pattern.replace("<robot>", robot)
 
 
@@ -316,7 +320,11 @@ _MATCHERS = tuple(
 
 
 def find(topic: str) -> tuple[Topic, str] | None:
-    """The row of a topic and the robot in it ("" if the topic names none); None if the table does not have it."""
+    """The row of a topic and the robot in it ("" if it names none); None if the table does not have it.
+
+    Args:
+        topic: its name, for example "/alpha/odometry".
+    """
     for matcher, row in _MATCHERS:
         match = matcher.fullmatch(topic)
         if match:

@@ -43,7 +43,14 @@ class Options(tum_layout.SequenceOptions):
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
-    """Convert a sequence, cut into `robots` contiguous parts.
+    """Convert a sequence, cut into contiguous parts.
+
+    Args:
+        src: folder of the sequence.
+        out: folder of the recording.
+        robots: how many parts.
+        force: replace a recording that is there.
+        options: of `Options`, by name.
 
     Raises:
         DuagError: names the file, what was found and what was expected.
@@ -68,7 +75,11 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
 
 
 def camera_pose(T_marker: np.ndarray | None) -> np.ndarray | None:
-    """T_world_camera [4, 4] of a line of groundtruth.txt; None of none."""
+    """T_world_camera [4, 4] of a line of groundtruth.txt; None of none.
+
+    Args:
+        T_marker: pose of the marker body, [4, 4]; None: not known.
+    """
     if T_marker is None:
         return None
     return se3.inverse(T_ROS) @ T_marker @ T_ROS @ T_MARKER_CAMERA

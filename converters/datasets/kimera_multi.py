@@ -76,6 +76,13 @@ class Options(AssociationOptions):
 def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **options: Any) -> None:
     """Convert a sequence; robots keep the names that the dataset gives them.
 
+    Args:
+        src: a bag, or the folder of a sequence.
+        out: folder of the recording.
+        robots: how many there must be; 0: as many as are found.
+        force: replace a recording that is there.
+        options: of `Options`, by name.
+
     Raises:
         DuagError: names file and topic, what was found and what was expected.
     """
@@ -179,7 +186,11 @@ def _robot_log(robot: _Robot, settings: Options, src: Path) -> RobotLog:
 
 
 def extrinsics(robot: str) -> tuple[Array, str]:
-    """T_infra1_color [4, 4] of a robot's camera, and whether it is "published" or what it is."""
+    """T_infra1_color [4, 4] of a robot's camera, and whether it is "published" or what it is.
+
+    Args:
+        robot: name that the dataset gives it.
+    """
     known = "published"
     if robot in ("thoth", "sobek"):
         known = "published, and the same as those of hathor"
@@ -222,7 +233,10 @@ def _truth_places(folder: Path, robot: _Robot, name: str) -> Iterator[Path]:
 
 
 def read_truth(path: Path) -> Poses:
-    """Poses of the body: integer nanoseconds, position, quaternion with w first.
+    """Poses of the body: integer nanoseconds, position (m), quaternion wxyz.
+
+    Args:
+        path: of the CSV file.
 
     Raises:
         DuagError: the columns are others, or a line is no pose.

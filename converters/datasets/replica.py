@@ -22,7 +22,14 @@ class Options(replica_layout.LayoutOptions):
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
-    """Convert a scene, cut into `robots` contiguous parts.
+    """Convert a scene, cut into contiguous parts.
+
+    Args:
+        src: folder of the scene.
+        out: folder of the recording.
+        robots: how many parts.
+        force: replace a recording that is there.
+        options: of `Options`, by name.
 
     Raises:
         DuagError: names the file, what was found and what was expected.

@@ -24,5 +24,16 @@ Options = replica_layout.TeamOptions
 
 
 def convert(src: Path, out: Path, robots: int = 2, force: bool = False, **options: Any) -> None:
-    """Convert a scene, one robot for each folder; see `replica_layout.convert_team`."""
+    """Convert a scene, one robot for each folder; see `replica_layout.convert_team`.
+
+    Args:
+        src: folder of the scene.
+        out: folder of the recording.
+        robots: how many folders are expected.
+        force: replace a recording that is there.
+        options: of `TeamOptions`, by name.
+
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
     replica_layout.convert_team(DATASET, src, out, robots, force=force, options=options)

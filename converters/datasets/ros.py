@@ -121,7 +121,15 @@ def _world_warnings(robot_logs: Mapping[str, RobotLog]) -> list[str]:
 
 
 def settle_clocks(recording: RecordingWriter, robot_logs: Mapping[str, RobotLog]) -> None:
-    """Say how the robots' clocks differ, and shift their times as the options ask."""
+    """Say how the robots' clocks differ, and shift their times as the options ask.
+
+    Args:
+        recording: gets the differences and warnings.
+        robot_logs: by the robots' names, the reference first; their `shift_ns` is changed.
+
+    Raises:
+        DuagError: a robot's recording would begin before time 0.
+    """
     for robot_log in robot_logs.values():
         robot_log.settle_drift()
     clocks = [robot_log.clock(robot) for robot, robot_log in robot_logs.items()]

@@ -32,7 +32,14 @@ class Options(image_folder.LengthOptions):
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
-    """Convert a scan, cut into `robots` contiguous parts. Frames without a pose are kept, without ground truth.
+    """Convert a scan, cut into contiguous parts. Frames without a pose are kept, without ground truth.
+
+    Args:
+        src: folder of the scan.
+        out: folder of the recording.
+        robots: how many parts.
+        force: replace a recording that is there.
+        options: of `Options`, by name.
 
     Raises:
         DuagError: names the file, what was found and what was expected.

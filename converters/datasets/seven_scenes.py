@@ -232,6 +232,9 @@ def _sequence_folders(src: Path, options: Options) -> list[Path]:
 def list_frames(folder: Path) -> tuple[list[SevenScenesFrame], list[int]]:
     """Frames of a sequence in order of their number, and the numbers that are missing in between.
 
+    Args:
+        folder: of the sequence.
+
     Raises:
         DuagError: a frame lacks its color, depth or (unless the sequence has no pose at all) its pose.
     """

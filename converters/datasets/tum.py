@@ -58,7 +58,14 @@ class Options(tum_layout.SequenceOptions):
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
-    """Convert a sequence, cut into `robots` contiguous parts.
+    """Convert a sequence, cut into contiguous parts.
+
+    Args:
+        src: folder of the sequence.
+        out: folder of the recording.
+        robots: how many parts.
+        force: replace a recording that is there.
+        options: of `Options`, by name.
 
     Raises:
         DuagError: names the file, what was found and what was expected.

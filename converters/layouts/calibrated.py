@@ -19,6 +19,10 @@ Numbers = tuple[float, ...]
 def numbers(text: str, counts: tuple[int, ...]) -> Numbers:
     """Numbers apart by commas or spaces; none in an empty text.
 
+    Args:
+        text: of an option.
+        counts: how many numbers there may be, besides none.
+
     Raises:
         ValueError: they are no finite numbers, or not as many as one of `counts`.
     """

@@ -24,7 +24,16 @@ Options = TypeVar("Options", bound=Config)
 
 
 def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) -> Options:
-    """The options of a converter. Raises DuagError that names a wrong one."""
+    """The options of a converter.
+
+    Args:
+        model: their type.
+        values: by name.
+        dataset: named in the error.
+
+    Raises:
+        DuagError: names a wrong one.
+    """
     try:
         return model(**values)
     except ValidationError as error:
@@ -39,7 +48,14 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of a color image."""
+    """Width and height of a color image, pixels.
+
+    Args:
+        path: of the image.
+
+    Raises:
+        DuagError: the file cannot be read, or no decoder reads it.
+    """
     import cv2
 
     image = decode_image(read_bytes(path, COLOR), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -49,12 +65,28 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_color(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """A color image of `size` (width, height), BGR [H, W, 3]."""
+    """A color image, BGR [h, w, 3].
+
+    Args:
+        path: of the image.
+        size: width and height that it must have, pixels.
+
+    Raises:
+        DuagError: no decoder reads it, or it has another size.
+    """
     return _whole_color(path, read_bytes(path, COLOR), size)
 
 
 def kept_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str]:
-    """The bytes of a color image of `size` (width, height), which a decoder reads, and their format."""
+    """The bytes of a color image, which a decoder reads, and their format, "jpeg" or "png".
+
+    Args:
+        path: of the image.
+        size: width and height that it must have, pixels.
+
+    Raises:
+        DuagError: no decoder reads it, or it has another size.
+    """
     import cv2
 
     data = read_bytes(path, COLOR)
@@ -106,13 +138,26 @@ def read_depth(
 
 
 def check_size(path: Path, shape: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Refuse an image of another size."""
+    """Refuse an image of another size.
+
+    Args:
+        path: of the image.
+        shape: (height, width, ...) of its array.
+        size: width and height that it must have, pixels.
+
+    Raises:
+        DuagError: it has another size.
+    """
     if (shape[1], shape[0]) != size:
         raise DuagError(f"{path}: is {shape[1]}x{shape[0]}, expected {size[0]}x{size[1]}")
 
 
 def rigid(T: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     """A pose [4, 4] with its rotation made exactly orthonormal.
+
+    Args:
+        T: [4, 4], as it was read.
+        where: begins the line of an error.
 
     Raises:
         DuagError: `where` holds something that is no rigid motion.

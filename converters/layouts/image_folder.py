@@ -99,7 +99,15 @@ class Clip:
     sensors: Mapping[str, str] = field(default_factory=dict)
 
     def cut(self, robots: int, src: Path) -> list[Clip]:
-        """Contiguous parts of equal length."""
+        """Contiguous parts of equal length.
+
+        Args:
+            robots: how many parts.
+            src: named in the error.
+
+        Raises:
+            DuagError: there are fewer frames than robots, or more robots than names.
+        """
         robot_names(robots)
         n = len(self.frames)
         if n < robots:
@@ -109,7 +117,12 @@ class Clip:
 
 
 def stamps_of(numbers: Sequence[int], rate_hz: int) -> list[int]:
-    """Times of frames of a dataset that has none, from their numbers."""
+    """Times (ns) of frames of a dataset that has none, from their numbers.
+
+    Args:
+        numbers: of the frames; number 0 is at time 0.
+        rate_hz: frames per second.
+    """
     return [number * NANOSECONDS // rate_hz for number in numbers]
 
 

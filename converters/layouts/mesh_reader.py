@@ -292,7 +292,12 @@ def _part(
 
 
 def texture_file(texture: int, level: int) -> str:
-    """Name of the file with one mip level of a texture."""
+    """Name of the file with one mip level of a texture.
+
+    Args:
+        texture: its index.
+        level: of the mip levels; 0: the finest.
+    """
     return f"texture-{texture}-{level}.npy"
 
 

@@ -121,6 +121,13 @@ def read_part(
 ) -> tuple[Clip, list[str]]:
     """The clip of one part, and warnings about what does not fit together.
 
+    Args:
+        folder: with results/ and traj.txt.
+        label: of the part in the dataset; empty: it is the only one.
+        camera: of color and depth.
+        depth_scale: meters per unit of depth images.
+        options: frame rate, and which frames are taken.
+
     Raises:
         DuagError: files are missing or broken.
     """

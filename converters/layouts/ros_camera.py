@@ -58,7 +58,16 @@ class RosCamera:
 
     @staticmethod
     def of(message: Any, rectified: bool, where: str) -> RosCamera:
-        """From a CameraInfo of ROS 1 or 2. rectified: the images belong to P, without distortion."""
+        """From a CameraInfo of ROS 1 or 2.
+
+        Args:
+            message: the CameraInfo.
+            rectified: the images belong to P, without distortion.
+            where: begins the line of an error.
+
+        Raises:
+            DuagError: it is not that of a camera.
+        """
         K, D, R, P = (
             np.array(getattr(message, name if hasattr(message, name) else name.lower()), dtype=np.float64)
             for name in ("K", "D", "R", "P")

@@ -40,7 +40,11 @@ class UnusableImage(DuagError):  # noqa: N818 (the name says it)
 
 
 def encoded_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header of a JPEG or PNG, without decoding; None if it is cut short or neither."""
+    """Width and height in the header of a JPEG or PNG, without decoding; None if it is cut short or neither.
+
+    Args:
+        data: the encoded image.
+    """
     if data.startswith(b"\x89PNG"):
         whole = len(data) > 24 and b"IEND" in data[-64:]
         return (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if whole else None
@@ -56,7 +60,11 @@ def encoded_size(data: bytes) -> tuple[int, int] | None:
 
 
 def is_cut_short(message: Any) -> bool:
-    """Whether a CompressedImage lacks its end (JPEG, PNG, WebP); that of compressedDepth has 12 bytes before it."""
+    """Whether a CompressedImage lacks its end (JPEG, PNG, WebP); compressedDepth has 12 bytes before it.
+
+    Args:
+        message: an Image is never cut short by this test.
+    """
     if not hasattr(message, "format"):
         return False
     data = bytes(message.data)
@@ -102,7 +110,11 @@ def check_decodes(data: bytes, where: str) -> None:
 
 
 def is_depth(message: Any) -> bool:
-    """Whether an Image or CompressedImage holds depth, by what it says of itself."""
+    """Whether an Image or CompressedImage holds depth, by what it says of itself.
+
+    Args:
+        message: an Image or CompressedImage.
+    """
     if hasattr(message, "encoding"):
         return message.encoding in DEPTH_ENCODINGS
     head = bytes(message.data[:26])
@@ -113,7 +125,11 @@ def is_depth(message: Any) -> bool:
 
 
 def is_integer_depth(message: Any) -> bool:
-    """Whether depth comes as integers, whose numbers can be kept; else as floats."""
+    """Whether depth comes as integers, whose numbers can be kept; else as floats.
+
+    Args:
+        message: an Image or CompressedImage that holds depth.
+    """
     encoding = message.encoding if hasattr(message, "encoding") else _encoding(message.format)
     return bool(encoding != "32FC1")
 
@@ -133,7 +149,15 @@ def _is_gray_png_of_16_bits(head: bytes) -> bool:
 
 
 def size_of(message: Any, where: str) -> tuple[int, int]:
-    """Width and height of an Image or CompressedImage."""
+    """Width and height of an Image or CompressedImage, pixels.
+
+    Args:
+        message: with color or depth.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: no decoder reads it.
+    """
     import cv2
 
     if hasattr(message, "encoding"):
@@ -148,7 +172,17 @@ def size_of(message: Any, where: str) -> tuple[int, int]:
 
 
 def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]:
-    """Pixels [h, w, channels] of an Image, without the padding of its rows, in native byte order."""
+    """Pixels [h, w, channels] of an Image, without the padding of its rows, in native byte order.
+
+    Args:
+        message: an Image.
+        where: begins the line of an error.
+        dtype: of a channel, without byte order.
+        channels: per pixel.
+
+    Raises:
+        UnusableImage: it is empty, or has too few bytes.
+    """
     kind = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
     if not (message.width > 0 and message.height > 0):
         raise UnusableImage(f"{where}: is {message.width}x{message.height} pixels, expected an image")
@@ -165,7 +199,15 @@ def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]
 
 
 def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
-    """Encoded color and its format: the message's own JPEG or PNG, or a PNG of its raw pixels."""
+    """Encoded color and its format: the message's own JPEG or PNG, or a PNG of its raw pixels.
+
+    Args:
+        message: an Image or CompressedImage.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: its encoding is none of color; UnusableImage: it is empty, cut short or of another format.
+    """
     import cv2
 
     if hasattr(message, "format"):
@@ -237,7 +279,13 @@ def _webp_as_png(data: bytes, where: str) -> bytes:
 
 
 def depth_m(message: Any, where: str, scale: float) -> Depth:
-    """Depth [h, w] in meters, 0 where there is none. scale: meters per unit of integer depth."""
+    """Depth [h, w] in meters, 0 where there is none.
+
+    Args:
+        message: an Image or CompressedImage that holds depth.
+        where: begins the line of an error.
+        scale: meters per unit of integer depth.
+    """
     return in_meters(depth_values(message, where), scale)
 
 
@@ -256,7 +304,15 @@ def in_meters(values: NDArray[np.uint16] | Depth, scale: float, float_scale: flo
 
 
 def depth_values(message: Any, where: str) -> NDArray[np.uint16] | Depth:
-    """Depth [h, w], 0 where there is none: integers as they stand but for the largest, uint16, or meters, float32."""
+    """Depth [h, w], 0 where there is none: uint16 as it stands but for the largest, or meters, float32.
+
+    Args:
+        message: an Image or CompressedImage that holds depth.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: its encoding is none of depth, or the image is broken.
+    """
     if hasattr(message, "format"):
         return _compressed_depth(message.format, _whole(message, where), where)
     if message.encoding in ("16UC1", "mono16"):

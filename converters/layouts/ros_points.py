@@ -89,7 +89,12 @@ class PointTimes:
         return PointTimes(words=_unknown_words(known, period_s))
 
     def seconds(self, values: Array, stamp: Any) -> Array:
-        """Seconds after the stamp of a message, of what the field of its points says."""
+        """Seconds after the stamp of a message, of what the field of its points says.
+
+        Args:
+            values: of the field, [n].
+            stamp: of the message, fields sec and nanosec.
+        """
         if not self.absolute:
             return values * self.unit_s
         per_s = round(1 / self.unit_s)
@@ -207,9 +212,14 @@ def as_of(
     *,
     motion: MotionPrior | None,
 ) -> Array:
-    """Points [n, 3] of a moving LiDAR, each measured at its time [n], as it would see them all at one time.
+    """Points of a moving LiDAR, each measured at its time, as it would see them all at one time, [n, 3].
 
-    motion: of the camera; without it, or where it does not reach, points stay as they are.
+    Args:
+        at_ns: that time.
+        points_lidar: [n, 3], meters, LiDAR frame.
+        times_ns: when each was measured, [n].
+        T_camera_lidar: [4, 4].
+        motion: of the camera; without it, or where it does not reach, points stay as they are.
     """
     if motion is None or not len(points_lidar):
         return points_lidar

@@ -25,7 +25,13 @@ class ReprojectionCheck:
     """Moves the depth of a frame into a later one by the poses and compares."""
 
     def __init__(self, camera: PinholeCamera, frames: int, gap: int = GAP) -> None:
-        """gap: frames between the two of a pair; more where the true poses are known to be rough."""
+        """Initialize.
+
+        Args:
+            camera: of the depth images.
+            frames: how many there are.
+            gap: frames between the two of a pair; more where the true poses are known to be rough.
+        """
         self._camera = camera
         gap = min(gap, frames - 1)
         starts: list[int] = []
@@ -40,7 +46,12 @@ class ReprojectionCheck:
         self._stated: list[NDArray[np.float64]] = []
 
     def needs(self, index: int, T_world_camera: NDArray[np.float64] | None) -> bool:
-        """Whether frame `index` is compared with another."""
+        """Whether a frame is compared with another.
+
+        Args:
+            index: of the frame.
+            T_world_camera: its pose, [4, 4]; None: not known.
+        """
         return T_world_camera is not None and (index in self._second or index in self._second.values())
 
     def add(

@@ -99,7 +99,15 @@ class StereoRig:
         *,
         R_rectified_left: Array | None = None,
     ) -> None:
-        """Of images that are rectified already, unless `maps` rectify the left and the right ones."""
+        """Of images that are rectified already, unless `maps` rectify the left and the right ones.
+
+        Args:
+            camera: of the rectified left images, before they are shrunk.
+            baseline_m: distance of the two cameras.
+            options: of matching and shrinking; None: the defaults.
+            maps: of `cv2.remap`, of the left and the right images; None: these are rectified.
+            R_rectified_left: [3, 3]; None: identity.
+        """
         self.options = options or StereoOptions()
         self.baseline_m, self._maps = float(baseline_m), maps
         k = self.options.shrink
@@ -173,6 +181,13 @@ class StereoRig:
     ) -> StereoRig:
         """A pair whose images are rectified already.
 
+        Args:
+            left: camera of the left images.
+            right: camera of the right images.
+            baseline_m: distance of the two cameras.
+            where: begins the line of an error.
+            options: of matching and shrinking; None: the defaults.
+
         Raises:
             DuagError: the cameras differ, or the right one is not to the right.
         """
@@ -199,7 +214,19 @@ class StereoRig:
         where: str,
         options: StereoOptions | None = None,
     ) -> StereoRig:
-        """A pair with the rectification of a CameraInfo: R [3, 3] and P [3, 4] of left and right."""
+        """A pair with the rectification of a CameraInfo.
+
+        Args:
+            left: camera of the left images, with distortion.
+            right: camera of the right images.
+            R: rotations to the rectified cameras, [3, 3], of left and right.
+            P: projections of the rectified cameras, [3, 4], of left and right.
+            where: begins the line of an error.
+            options: of matching and shrinking; None: the defaults.
+
+        Raises:
+            DuagError: as `rectified`.
+        """
         a, b = (_of_projection(p, (left.width, left.height)) for p in P)
         rig = StereoRig.rectified(a, b, -float(P[1][0, 3]) / float(P[1][0, 0]), where, options=options)
         turns = [np.asarray(r, dtype=np.float64).reshape(3, 3) for r in R]
@@ -216,7 +243,11 @@ class StereoRig:
         return shrunk(mask, self.options.shrink)
 
     def rectify_left(self, image: Image) -> Image:
-        """A left image, gray or color, as the rectified camera sees it."""
+        """A left image as the rectified camera sees it.
+
+        Args:
+            image: [h, w] or [h, w, 3].
+        """
         return self._rectify(image, 0)
 
     def rectify_right(self, image: Image) -> Image:
@@ -270,7 +301,12 @@ class StereoRig:
         return np.where((found > 0) & (found <= column), found, np.float32(0))
 
     def depth(self, left: Image, right: Image) -> tuple[Depth, Depth]:
-        """Depth and its standard deviation, meters [h, w], of rectified gray images; both 0 where not known."""
+        """Depth and its standard deviation, meters [h, w], of rectified images; both 0 where not known.
+
+        Args:
+            left: gray, [h, w].
+            right: gray, [h, w].
+        """
         disparity = self.disparity(left, right)
         known = disparity > 0
         depth_m = np.where(known, self.camera.fx * self.baseline_m / np.where(known, disparity, 1), 0)
@@ -287,6 +323,9 @@ class StereoRig:
         The best that matching does, and the noise of the gray values over their gradient along the row (root mean
         square over a block). On the simulated room, three sizes and noises, errors over this have a spread (by their
         median) of 0.93 to 1.23; 2 to 6 % are beyond 3, mostly at edges.
+
+        Args:
+            left: [h, w].
         """
         import cv2
 
@@ -334,6 +373,9 @@ class RowCheck:
 
     def result(self, where: str) -> dict[str, Any]:
         """Medians of the row difference (absolute, in pixels of the rectified image) and of the disparity.
+
+        Args:
+            where: begins the line of an error.
 
         Raises:
             DuagError: too few matches to judge, or rows or the order of the cameras do not fit.

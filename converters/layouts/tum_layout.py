@@ -80,7 +80,15 @@ class Listed:
 
 
 def nanoseconds(text: str, where: str) -> int:
-    """Decimal seconds as integer nanoseconds, exactly."""
+    """Decimal seconds as integer nanoseconds, exactly.
+
+    Args:
+        text: such as 1305031102.175304.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: it is no number, or a time after 2115.
+    """
     try:
         time_ns = Decimal(text) * NANOSECONDS
         if abs(time_ns) < LAST_NS:
@@ -92,6 +100,9 @@ def nanoseconds(text: str, where: str) -> int:
 
 def read_list(path: Path) -> list[Listed]:
     """A list of images, in order of time.
+
+    Args:
+        path: lines of time (s) and file name, the latter from the folder of the list; # begins a comment.
 
     Raises:
         DuagError: a line is not a time and a file name, or a time comes twice.
@@ -116,7 +127,13 @@ def read_list(path: Path) -> list[Listed]:
 def associate(
     color: list[Listed], depth: list[Listed], options: AssociationOptions
 ) -> list[tuple[Listed, Listed]]:
-    """Pairs of color and depth, in order of the color's time."""
+    """Pairs of color and depth, in order of the color's time.
+
+    Args:
+        color: in order of time.
+        depth: in order of time.
+        options: which pairs are taken, and their largest difference of time.
+    """
     limit = options.limit_ns
     times = [d.stamp_ns for d in depth]
     if options.association != "official":
@@ -171,7 +188,14 @@ class Poses:
 
     @staticmethod
     def read(path: Path) -> Poses:
-        """From `timestamp tx ty tz qx qy qz qw`, also with commas; lines with nan are counted and left out."""
+        """From lines `timestamp tx ty tz qx qy qz qw`, also with commas; those with nan are only counted.
+
+        Args:
+            path: of the file; times in seconds, positions in meters.
+
+        Raises:
+            DuagError: a line is not eight numbers, or there is no pose.
+        """
         rows: dict[int, list[float]] = {}
         unusable = 0
         for number, line in enumerate(read_text(path, "lines of time and pose").splitlines(), start=1):
@@ -199,7 +223,12 @@ class Poses:
         return Poses(np.array(stamps, dtype=np.int64), T, unusable)
 
     def at(self, stamp_ns: int, max_gap_s: float) -> Array | None:
-        """Pose [4, 4] at a time: interpolated between two measured ones; None where there are none near."""
+        """Pose [4, 4] at a time: interpolated between two measured ones; None where there are none near.
+
+        Args:
+            stamp_ns: by the clock of the poses.
+            max_gap_s: largest time between the two measured ones, seconds.
+        """
         k = int(np.searchsorted(self.stamps_ns, stamp_ns))
         if k < len(self.stamps_ns) and self.stamps_ns[k] == stamp_ns:
             return self.T_world_body[k]
@@ -240,7 +269,15 @@ class Poses:
 
 
 def frames_of(src: Path, options: SequenceOptions) -> tuple[list[FrameFiles], Poses | None, list[str]]:
-    """Frames of a sequence with the pose of its body, the poses, and warnings."""
+    """Frames of a sequence with the pose of its body, the poses, and warnings.
+
+    Args:
+        src: folder with rgb.txt, depth.txt and, if there is ground truth, groundtruth.txt.
+        options: of association and times, and which frames are taken.
+
+    Raises:
+        DuagError: a file is missing or broken, or nothing in them belongs together.
+    """
     if not src.is_dir():
         raise DuagError(f"{src}: no such folder, expected rgb.txt, depth.txt and groundtruth.txt in it")
     color, depth = options.first(read_list(src / "rgb.txt")), read_list(src / "depth.txt")

@@ -168,6 +168,9 @@ USER_MASKS: ContextVar[Mapping[str, Sequence[UserMask]] | None] = ContextVar("us
 def read_mask(path: Path) -> UserMask:
     """A mask image: PNG of 8 bits; 0 = does not show the scene, anything else = shows it.
 
+    Args:
+        path: of the PNG.
+
     Raises:
         DuagError: it is no such image, or leaves no pixel.
     """

@@ -21,7 +21,16 @@ Raw = tuple[Any, int, bytes]  # connection, time of recording in ns, bytes
 def messages(reader: Any, topics: Collection[str], heads: Collection[str]) -> Iterator[Raw]:
     """Messages of some topics in the order of their times; of those of `heads` the first bytes are enough.
 
-    reader: `AnyReader` of one bag or folder.
+    Args:
+        reader: `AnyReader` of one bag or folder.
+        topics: their names.
+        heads: names of those topics whose messages may be cut behind the header.
+
+    Yields:
+        Connection, time of recording (ns) and bytes of each message.
+
+    Raises:
+        ValueError: the index leads to a message of another topic.
     """
     connections = [c for c in reader.connections if c.topic in topics]
     if not connections:

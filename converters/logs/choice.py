@@ -55,6 +55,10 @@ class Choice:
     def required(self, log: Log, option: str) -> str:
         """The topic.
 
+        Args:
+            log: named in the error.
+            option: that names the topic, unless `expected` says otherwise.
+
         Raises:
             DuagError: there is none; names the option that decides.
         """
@@ -139,7 +143,12 @@ class Chooser:
         return [topic for topic, count in zip(topics, shared, strict=True) if count == max(shared)]
 
     def info(self, option: str, image_topic: str) -> Choice:
-        """CameraInfo of an image topic: the one where ROS looks for it, else whose name shares most with it."""
+        """CameraInfo of an image topic: the one where ROS looks for it, else whose name shares most with it.
+
+        Args:
+            option: "color_info" or "depth_info"; if it is set, its topic is the choice.
+            image_topic: of the images.
+        """
         if self._wanted.get(option):
             return self._told(option, self.infos)
         by_parts = {_parts(info): info for info in self.infos}
@@ -258,7 +267,15 @@ def first_usable(log: Log, topic: str) -> Any:
 
 
 def packet_words(log: Log, namespace: str) -> str:
-    """What to add to a complaint that there are no points: topics that hold them as their driver has them."""
+    """What to add to a complaint that there are no points: topics that hold them as their driver has them.
+
+    Args:
+        log: whose topics are searched.
+        namespace: of the robot; empty: the whole log.
+
+    Returns:
+        Words that begin with "; ", or an empty string.
+    """
     found = sorted(
         f"{t.name} ({t.type})"
         for t in log.topics.values()
@@ -283,7 +300,12 @@ def info_parts(image_topic: str) -> list[tuple[str, ...]]:
 
 
 def shared_parts(a: str, b: str) -> int:
-    """How many parts two topics have in common from the left."""
+    """How many parts two topics have in common from the left.
+
+    Args:
+        a: a topic, such as /camera/color/image.
+        b: another one.
+    """
     count = 0
     for x, y in zip(_parts(a), _parts(b), strict=False):
         if x != y:

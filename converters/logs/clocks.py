@@ -159,7 +159,11 @@ class Offset:
 
 
 def compare(clocks: Sequence[RobotClock]) -> dict[str, Offset]:
-    """Offset of every robot's times to those of the first."""
+    """Offset of every robot's times to those of the first, by the robots' names.
+
+    Args:
+        clocks: of all robots, the reference first.
+    """
     reference = clocks[0]
     out = {reference.robot: Offset(0.0, 0.0, 0.0, "the reference")}
     known: dict[tuple[str, ...], Times] = {}
@@ -169,7 +173,11 @@ def compare(clocks: Sequence[RobotClock]) -> dict[str, Offset]:
 
 
 def overlap_warnings(clocks: Sequence[RobotClock]) -> list[str]:
-    """Robots whose times have nothing in common with those of the first."""
+    """Robots whose times have nothing in common with those of the first.
+
+    Args:
+        clocks: of all robots, the reference first.
+    """
     first = clocks[0]
     return [
         f"{c.robot}: its times ({c.start_ns / NANOSECONDS:.3f} to {c.end_ns / NANOSECONDS:.3f} s) have none in common "
@@ -275,6 +283,13 @@ def lag(
 ) -> tuple[float, float] | None:
     """How much later b turns than a, by angular speeds (rad/s) that one body shows to two sensors.
 
+    Args:
+        stamps_a_ns: increasing times of the first sensor, [n].
+        speed_a: angular speed at these times, rad/s, [n].
+        stamps_b_ns: increasing times of the second sensor, [m].
+        speed_b: angular speed at these times, rad/s, [m].
+        most_s: largest lag that is tried, in either direction, seconds.
+
     Returns:
         Lag in seconds and the correlation there; None if they do not correlate, or hardly turn.
     """
@@ -302,7 +317,12 @@ def lag(
 
 
 def angular_speed(stamps_ns: NDArray[np.int64], T_world_body: Array) -> tuple[NDArray[np.int64], Array]:
-    """Times between the poses [n, 4, 4] of a body, and how fast it turned there (rad/s), [n - 1] each."""
+    """Times between the poses [n, 4, 4] of a body, and how fast it turned there (rad/s), [n - 1] each.
+
+    Args:
+        stamps_ns: increasing times of the poses, [n].
+        T_world_body: [n, 4, 4].
+    """
     R = T_world_body[:, :3, :3]
     turned = np.linalg.norm(so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:]), axis=-1)
     steps = np.diff(stamps_ns)

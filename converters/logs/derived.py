@@ -62,11 +62,22 @@ class Derived(Protocol):
     valid: Mask | None
 
     def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
-        """Of a color message and that which goes with it."""
+        """Of a color message and that which goes with it.
+
+        Args:
+            color: message with the color image (of a stereo pair, the left one).
+            partner: message with the right image, or with the points of a LiDAR.
+            color_ns: time of the color message.
+            partner_ns: time of the other message.
+        """
         ...
 
     def depth_m(self, picture: Picture) -> Array:
-        """Depth [h, w] in meters of a picture, 0 = none."""
+        """Depth [h, w] in meters of a picture, 0 = none.
+
+        Args:
+            picture: as from `picture`.
+        """
         ...
 
 
@@ -77,20 +88,43 @@ class Stereo:
     words = "stereo"
 
     def __init__(self, rig: StereoRig, size: tuple[int, int], where: str) -> None:
-        """size: of the images as they come. where: begins the line of an error."""
+        """Initialize.
+
+        Args:
+            rig: rectification and maps of the pair.
+            size: width and height of the images as they come, pixels.
+            where: begins the line of an error.
+        """
         self._frames, self._where = StereoFrames(rig, size), where
         self.camera, self.valid = rig.camera, rig.valid
         self.T_color_camera = se3.from_rotation_translation(rig.R_rectified_left.T, np.zeros(3))
 
     def check(self, pairs: Sequence[tuple[Any, Any]]) -> dict[str, Any]:
-        """The test of the rectification on some pairs of messages."""
+        """The test of the rectification on some pairs of messages.
+
+        Args:
+            pairs: messages of the left and the right image.
+        """
         return self._frames.check_rows(pairs, self._where)
 
     def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
+        """The rectified left image, and depth with its standard deviation by matching.
+
+        Args:
+            color: message with the left image.
+            partner: message with the right image.
+            color_ns: time of the left image.
+            partner_ns: not used.
+        """
         data, depth, sigma_m = self._frames.frame(color, partner, f"{self._where} at {color_ns} ns")
         return Picture(data, "png", depth, sigma_m)
 
     def depth_m(self, picture: Picture) -> Array:
+        """Depth [h, w] in meters of a picture, 0 = none.
+
+        Args:
+            picture: with depth.
+        """
         assert picture.depth is not None
         return np.asarray(picture.depth, dtype=np.float64) * self.scale
 
@@ -119,6 +153,17 @@ class Sweeps:
         self.range_sigma_m = lidar.range_sigma_m
 
     def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
+        """The color image and the points of the sweep, moved to its time.
+
+        Args:
+            color: message with the color image.
+            partner: message with the points.
+            color_ns: time of the color image.
+            partner_ns: time of the points.
+
+        Raises:
+            DuagError: a message cannot be read.
+        """
         where = f"{self._where[0]} at {color_ns} ns"
         data, color_format = color_bytes(color, where)
         if hasattr(color, "format"):
@@ -127,6 +172,11 @@ class Sweeps:
         return Picture(data, color_format, points_lidar=points)
 
     def depth_m(self, picture: Picture) -> Array:
+        """Depth [h, w] in meters, 0 = none, drawn from the points of a picture.
+
+        Args:
+            picture: with points.
+        """
         assert picture.points_lidar is not None
         depth_m, _ = lidar_depth(picture.points_lidar, self.T_camera_lidar, self.camera, self.range_sigma_m)
         return depth_m.astype(np.float64)
@@ -222,6 +272,14 @@ def sweeps_of(
 ) -> Sweeps:
     """The LiDAR of a topic of points; where it is comes from `T_color_depth`, else from constant transforms.
 
+    Args:
+        log: with the points.
+        color: topic and camera of the color images.
+        topic: of the points.
+        transforms: constant transforms of the log.
+        motion: how the robot moves meanwhile; None: not known, and the sweeps stay as they are.
+        settings: options of the conversion, with `T_color_depth` and `range_sigma_m`.
+
     Raises:
         DuagError: nothing says where it is.
     """
@@ -252,6 +310,10 @@ def sweeps_of(
 
 
 def some_pairs(pairs: dict[int, int]) -> list[tuple[int, int]]:
-    """Up to `ROW_PAIRS` pairs of times, evenly spread."""
+    """Up to `ROW_PAIRS` pairs of times, evenly spread.
+
+    Args:
+        pairs: time of the partner by time of the color image, ns.
+    """
     stamps = sorted(pairs)
     return [(stamps[k], pairs[stamps[k]]) for k in sorted(spread(len(stamps), ROW_PAIRS))]

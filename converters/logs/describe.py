@@ -34,7 +34,11 @@ HEADERS_FIRST, HEADERS_EACH = (
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a path is a log, or a folder of logs, that other programs wrote, or a TOML file about such."""
+    """Whether a path is a log, or a folder of logs, that other programs wrote, or a TOML file about such.
+
+    Args:
+        path: a file or a folder; need not exist.
+    """
     if path.suffix == ".toml":
         return path.is_file()
     if path.suffix == ".mcap" and path.is_file():
@@ -53,6 +57,9 @@ def is_foreign(path: Path) -> bool:
 
 def describe(src: Path) -> dict[str, Any]:
     """Topics, rates and times of logs; per robot what would be chosen and why, or why not; how clocks differ.
+
+    Args:
+        src: a log, a folder of logs or a TOML file.
 
     Returns:
         Plain numbers and text, ready for JSON.
@@ -105,6 +112,9 @@ def namespaces(log: Log) -> list[str]:
 
     They are where the names of its images part: /fleet/r1 and /fleet/r2, or /r1 and /r2.
     Where messages that hold both, or video, only repeat what another namespace has, theirs does not count.
+
+    Args:
+        log: whose topics are looked at.
     """
     images = [t.name for t in log.topics.values() if t.count and (t.type in IMAGE_TYPES or is_video(t.type))]
     folders = [name.strip("/").split("/")[:-1] for name in images]
@@ -221,7 +231,11 @@ def _robot(log: Log, source: Source) -> tuple[RobotLog | None, dict[str, Any]]:
 
 
 def format_description(content: Mapping[str, Any]) -> str:
-    """The result of `describe` as text."""
+    """The result of `describe` as text.
+
+    Args:
+        content: of `describe`.
+    """
     lines = []
     for name, log in content["logs"].items():
         lines += _log_lines(name, log)
@@ -271,7 +285,11 @@ def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
 
 
 def toml_text(content: Mapping[str, Any]) -> str:
-    """A TOML file that says what a conversion would choose, for `duagc convert ros FILE`; what is open is a comment."""
+    """A TOML file for `duagc convert ros FILE`: what a conversion would choose; what is open is a comment.
+
+    Args:
+        content: of `describe`.
+    """
     sources = sorted({s for log in content["logs"].values() for s in log["time_sources"]})
     lines = [
         "# duagc convert ros THIS_FILE --out RECORDING",

@@ -66,7 +66,9 @@ class LogPart(Protocol):
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
         """Messages of these topics in order of recording.
 
-        heads: those of which `header_ns` is all that will be asked; `data` may be cut behind it.
+        Args:
+            topics: their names.
+            heads: those of which `header_ns` is all that will be asked; `data` may be cut behind it.
         """
         ...
 
@@ -74,7 +76,15 @@ class LogPart(Protocol):
 
 
 def sound_time(time_ns: int, where: str) -> int:
-    """A time that can be computed with. Raises DuagError for one before 1970 or after 2115."""
+    """A time that can be computed with.
+
+    Args:
+        time_ns: since 1970.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: it is before 1970 or after 2115.
+    """
     if not 0 <= time_ns < LAST_NS:
         raise DuagError(f"{where}: time {time_ns} ns, expected one between the years 1970 and 2116")
     return time_ns
@@ -101,12 +111,20 @@ def raw_image(header: Any, pixels: NDArray[Any], encoding: str) -> SimpleNamespa
 
 
 def ros_type(schema: str) -> str:
-    """A type of ROS by the name that ROS 2 has for it: "sensor_msgs/Image" is "sensor_msgs/msg/Image"."""
+    """A type of ROS by the name that ROS 2 has for it: "sensor_msgs/Image" is "sensor_msgs/msg/Image".
+
+    Args:
+        schema: name of a type, of ROS 1 or ROS 2; other names stay as they are.
+    """
     parts = schema.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else schema
 
 
 def stamp_ns(message: Any) -> int:
-    """The time in the header of a message, 0 where it has none."""
+    """The time in the header of a message, 0 where it has none.
+
+    Args:
+        message: of ROS, with fields as attributes.
+    """
     header = getattr(message, "header", None)
     return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec) if header else 0

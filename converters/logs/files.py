@@ -32,7 +32,15 @@ class Log:
     """One or several containers read as one; a context manager."""
 
     def __init__(self, parts: Sequence[LogPart], name: str) -> None:
-        """name: how messages for people call it."""
+        """Initialize.
+
+        Args:
+            parts: the containers; a topic may be in several.
+            name: how messages for people call it.
+
+        Raises:
+            DuagError: two parts have a topic of one name and different types.
+        """
         self.parts, self.name = list(parts), name
         self.topics: dict[str, LogTopic] = {}
         for part in self.parts:
@@ -52,13 +60,23 @@ class Log:
             part.close()
 
     def of_type(self, *types: str, below: str = "") -> list[str]:
-        """Names of topics of these types that have messages, in a namespace."""
+        """Names of topics of these types that have messages, in a namespace.
+
+        Args:
+            types: names of types as `topics` has them.
+            below: the namespace; empty: all topics.
+        """
         return sorted(
             t.name for t in self.topics.values() if t.type in types and t.count and is_below(t.name, below)
         )
 
     def entries(self, *topics: str, heads: Collection[str] = ()) -> Iterator[Entry]:
-        """Messages of these topics, in order of recording over all parts; heads: see `LogPart.entries`."""
+        """Messages of these topics, in order of recording over all parts.
+
+        Args:
+            topics: their names; video comes as the images that it shows, if its topic is not in `heads`.
+            heads: see `LogPart.entries`.
+        """
         films = {t for t in topics if t in self.topics and is_video(self.topics[t].type)} - set(heads)
         streams = [
             part.entries(wanted, [t for t in wanted if t in heads])
@@ -72,7 +90,14 @@ class Log:
         return _merged(streams)
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic."""
+        """The first message of a topic.
+
+        Args:
+            topic: its name.
+
+        Raises:
+            DuagError: it has no message, or the first one cannot be read.
+        """
         entry = next(iter(self.entries(topic)), None)
         if entry is None:
             raise DuagError(f"{self.name}: {topic} has no message, expected one")
@@ -110,6 +135,10 @@ def is_below(topic: str, namespace: str) -> bool:
 
 def open_log(paths: Sequence[Path], name: str = "") -> Log:
     """Open containers, to be read as one log.
+
+    Args:
+        paths: files or folders, the containers of one log.
+        name: how messages for people call it; empty: by the first path.
 
     Raises:
         DuagError: a file is missing, of another kind, or broken.

@@ -35,7 +35,14 @@ _POINT_TYPE_NAMES = ("UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLO
 
 
 def plain_name(schema: str) -> str:
-    """Foxglove's name of a schema that ROS or JSON spell otherwise, such as "foxglove_msgs/msg/RawImage"."""
+    """Foxglove's name of a schema that ROS or JSON spell otherwise, such as "foxglove_msgs/msg/RawImage".
+
+    Args:
+        schema: name of a type, of Foxglove or not.
+
+    Returns:
+        The name with "foxglove." before it; that of another schema as it is.
+    """
     parts = schema.split("/")
     if len(parts) > 1 and parts[0] in ("foxglove", "foxglove_msgs"):
         return f"foxglove.{parts[-1]}"
@@ -59,7 +66,15 @@ def as_ros(schema: str, message: Any, where: str) -> Any:
 
 
 def stamp_ns(message: Any, where: str) -> int:
-    """The time of a message of Foxglove."""
+    """The time of a message of Foxglove, ns.
+
+    Args:
+        message: with a field `timestamp`.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: the time cannot be read.
+    """
     with _readable("timestamp", where):
         stamp = _stamp(message.timestamp)
         return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
@@ -79,6 +94,11 @@ class JsonFields:
     """A JSON object whose members are attributes; members that are objects too."""
 
     def __init__(self, members: dict[str, Any]) -> None:
+        """Initialize.
+
+        Args:
+            members: of the JSON object, by name.
+        """
         self._members = members
 
     def __getattr__(self, name: str) -> Any:
@@ -99,7 +119,14 @@ _STAMP = re.compile(
 
 
 def json_members(data: bytes) -> Any:
-    """A JSON text as Python has it. Long `data` without escapes is not walked through: it comes as `Base64`."""
+    """A JSON text as Python has it. Long `data` without escapes is not walked through: it comes as `Base64`.
+
+    Args:
+        data: the text, UTF-8.
+
+    Raises:
+        ValueError: it is no JSON.
+    """
     name = data.find(b'"data"')
     colon = data[name + 6 : name + 64].lstrip(_SPACE)
     if name < 0 or not colon.startswith(b":") or not colon[1:].lstrip(_SPACE).startswith(b'"'):
@@ -116,13 +143,24 @@ def json_members(data: bytes) -> Any:
 
 
 def first_stamp_of_json(head: bytes) -> int | None:
-    """The time of a message whose first member is `timestamp`; None if that is not so."""
+    """The time (ns) of a message whose first member is `timestamp`; None if that is not so.
+
+    Args:
+        head: first bytes of the message.
+    """
     found = _STAMP.match(head)
     return int(found[1]) * 1_000_000_000 + int(found[2]) if found else None
 
 
 def first_stamp_of_protobuf(head: bytes) -> int | None:
-    """The time of a message whose first field is `timestamp` (number 1, as in all of Foxglove's but lists)."""
+    """The time (ns) of a message whose first field is `timestamp` (number 1, in all of Foxglove's but lists).
+
+    Args:
+        head: first bytes of the message.
+
+    Returns:
+        None if that is not so, or the bytes end before the time does.
+    """
     from google.protobuf.timestamp_pb2 import Timestamp
 
     if head[:1] != b"\x0a" or not 2 <= (length := head[1] if len(head) > 1 else 0) <= min(127, len(head) - 2):

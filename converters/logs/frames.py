@@ -75,6 +75,10 @@ class Transforms:
     def lookup(self, target: str, source: str) -> Array | None:
         """T_target_source [4, 4]; None if nothing constant ties them together, or one has no name.
 
+        Args:
+            target: frame, with or without a slash before it.
+            source: frame, the same.
+
         Raises:
             DuagError: only a transform that is none does.
         """
@@ -156,7 +160,13 @@ class Unsound:
 
 
 def transforms_in(entry: Entry, where: str, unsound: Unsound) -> Iterator[tuple[int, str, str, Array]]:
-    """Time of the header (ns), parent, child and T_parent_child [4, 4] of every sound transform of a message."""
+    """Time of the header (ns), parent, child and T_parent_child [4, 4] of every sound transform of a message.
+
+    Args:
+        entry: a message of transforms.
+        where: begins the line of an error or warning.
+        unsound: gets the transforms that are none; they are left out.
+    """
     for t in entry.read().transforms:
         parent, child = frame_name(t.header.frame_id), frame_name(t.child_frame_id)
         T = unsound.matrix(t.transform.translation, t.transform.rotation, where, (parent, child))
@@ -183,12 +193,21 @@ def body_axes_of_camera(color_frame: str, frame: str, T: Array, option: str) -> 
 
 
 def frame_name(name: str) -> str:
-    """A frame without the slash that ROS 1 may put before it."""
+    """A frame without the slash that ROS 1 may put before it.
+
+    Args:
+        name: as a message has it.
+    """
     return name.removeprefix("/")
 
 
 def pose_matrix(position: Any, orientation: Any, where: str) -> Array:
     """Matrix [4, 4] of a position and a quaternion with fields x, y, z, w.
+
+    Args:
+        position: fields x, y, z, meters.
+        orientation: quaternion of unit length, fields x, y, z, w.
+        where: begins the line of an error.
 
     Raises:
         DuagError: the quaternion is no rotation, or the position is not finite.

@@ -23,6 +23,11 @@ def gathered(
     Groups should follow the order of recording: what arrives before its group is due is kept. Of several messages of
     one topic and time the first counts; a group whose messages do not all come ends the iteration.
 
+    Args:
+        log: with the messages.
+        groups: time (ns) by topic, of each group.
+        time_ns: the time of a message, by the same clock as those of the groups.
+
     Raises:
         DuagError: more would have to be kept than memory should hold: times and recording are in different orders.
     """
@@ -49,7 +54,16 @@ def gathered(
 
 
 def nearest(times_ns: Sequence[int], others_ns: Sequence[int], most_ns: int) -> dict[int, int]:
-    """For each time the nearest of the others (of two the earlier), where that is near enough. Both increasing."""
+    """For each time the nearest of the others (of two the earlier), where that is near enough.
+
+    Args:
+        times_ns: increasing.
+        others_ns: increasing.
+        most_ns: largest difference.
+
+    Returns:
+        The other time by the time; times without one are left out.
+    """
     if not len(times_ns) or not len(others_ns):
         return {}
     ours, theirs = np.asarray(times_ns, np.int64), np.asarray(others_ns, np.int64)

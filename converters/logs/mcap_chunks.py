@@ -39,12 +39,26 @@ class Chunks:
     """The chunks of one file that its index lists."""
 
     def __init__(self, stream: IO[bytes], indexes: Sequence[ChunkIndex]) -> None:
+        """Initialize.
+
+        Args:
+            stream: the file, open for reading bytes; it stays open.
+            indexes: of its chunks.
+        """
         self._stream = stream
         self._indexes = sorted(indexes, key=lambda i: (i.message_start_time, i.chunk_start_offset))
         self._compared: set[int] = set()
 
     def messages(self, wanted: Mapping[int, Enough]) -> Iterator[LogMessage]:
-        """The messages of some channels."""
+        """The messages of some channels, in the order of their times.
+
+        Args:
+            wanted: by number of a channel, whether the first bytes of a message are enough; None: all of it
+                is wanted.
+
+        Raises:
+            ValueError: a chunk is broken.
+        """
         waiting: list[LogMessage] = []
         for index in self._indexes:
             if wanted.keys().isdisjoint(index.message_index_offsets):

@@ -37,6 +37,14 @@ class McapFile:
     """An MCAP file. Without an index it is read from its beginning, in the order of the file."""
 
     def __init__(self, path: Path) -> None:
+        """Open a file and read its summary.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            DuagError: it is missing or broken.
+        """
         self.path = path
         self.topics: dict[str, LogTopic] = {}
         self._decoders: dict[int, _Decoder] = {}
@@ -168,6 +176,15 @@ class McapFile:
                 yield record.channel_id, record.log_time, record.publish_time, record.data
 
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
+        """Messages of these topics in order of recording.
+
+        Args:
+            topics: their names.
+            heads: those of which `header_ns` is all that will be asked; `data` may be cut behind it.
+
+        Raises:
+            DuagError: the file is broken, or a message has no sound time.
+        """
         with reading(self.path, WANTED):
             for number, log_ns, publish_ns, data in self._messages(topics, heads):
                 topic, decoder = self._channels[number].topic, self._decoders[number]

@@ -58,7 +58,12 @@ class CameraPoses:
     T_body_color: Array
 
     def at(self, stamp_ns: int, max_gap_s: float) -> Array | None:
-        """Pose [4, 4] of the color camera at a time; None where there is none near."""
+        """Pose T_world_color [4, 4] of the color camera at a time; None where there is none near.
+
+        Args:
+            stamp_ns: by the clock of the poses.
+            max_gap_s: largest time between the two poses around it, seconds.
+        """
         T = self.body.at(stamp_ns, max_gap_s)
         return None if T is None else T @ self.T_body_color
 
@@ -274,7 +279,15 @@ class MotionReader:
 
 
 def extrinsics_of(option: str, text: str) -> Array:
-    """Matrix [4, 4] of "x y z qw qx qy qz" (m), the value of an option."""
+    """Matrix [4, 4] of "x y z qw qx qy qz" (m), the value of an option.
+
+    Args:
+        option: its name, for the error.
+        text: its value: meters, and a quaternion wxyz of unit length.
+
+    Raises:
+        DuagError: the text is not seven such numbers.
+    """
     try:
         x, y, z, *q = np.array(text.split(), dtype=np.float64).tolist()
         if len(q) != 4 or not np.isfinite([x, y, z]).all() or abs(np.linalg.norm(q) - 1) > 0.01:

@@ -31,7 +31,11 @@ _MEMBERS = {  # of the messages, by the topics that they are read as
 
 
 def holds_rgbd(kind: str) -> bool:
-    """Whether messages of a type hold color, depth and cameras; the type is ROS's name of it."""
+    """Whether messages of a type hold color, depth and cameras.
+
+    Args:
+        kind: ROS 2's name of the type.
+    """
     return kind == _REALSENSE or kind in _RTABMAP
 
 

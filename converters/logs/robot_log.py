@@ -52,6 +52,13 @@ class RobotLog:
     """
 
     def __init__(self, log: Log, namespace: str, settings: LogOptions) -> None:
+        """Initialize.
+
+        Args:
+            log: open; it must stay so.
+            namespace: of the robot's topics; empty: the whole log.
+            settings: options of the conversion.
+        """
         self.log, self.namespace, self.settings = log, namespace.rstrip("/"), settings
         self.name = log.name
         self.warnings: list[str] = []

@@ -31,12 +31,21 @@ _ALIASES = {
 
 
 def is_read(kind: str) -> bool:
-    """Whether messages of a type, by ROS 2's name of it, are read from JSON."""
+    """Whether messages of a type are read from JSON.
+
+    Args:
+        kind: ROS 2's name of the type.
+    """
     return kind in READ_TYPES
 
 
 def read(kind: str, data: bytes, where: str) -> Any:
     """A message of ROS 2's definition of `kind`.
+
+    Args:
+        kind: ROS 2's name of the type.
+        data: JSON, UTF-8.
+        where: begins the line of an error.
 
     Raises:
         DuagError: it is no JSON, a field is missing or of another kind.
@@ -50,7 +59,16 @@ def read(kind: str, data: bytes, where: str) -> Any:
 
 
 def header_ns(kind: str, data: bytes, where: str) -> int:
-    """The time in the header of a message, without its data; 0 where it has no header. Raises DuagError as `read`."""
+    """The time (ns) in the header of a message, without its data; 0 where it has no header.
+
+    Args:
+        kind: ROS 2's name of the type, for the error.
+        data: JSON, UTF-8.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: as `read`.
+    """
     try:
         members = json_members(data)
         if not isinstance(members, dict) or "header" not in members:

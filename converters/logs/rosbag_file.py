@@ -35,6 +35,14 @@ class RosBag:
     """A bag, read by rosbags. Bags of ROS 2 without types are read with those of `definitions`."""
 
     def __init__(self, path: Path) -> None:
+        """Open a bag and read what topics it has.
+
+        Args:
+            path: a file, or a folder of `ros2 bag`.
+
+        Raises:
+            DuagError: it is missing or broken, or defines types otherwise than ROS does.
+        """
         from rosbags.rosbag1 import Reader as Reader1
 
         self.path = path
@@ -74,6 +82,15 @@ class RosBag:
         return topics
 
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
+        """Messages of these topics in order of recording.
+
+        Args:
+            topics: their names.
+            heads: those of which `header_ns` is all that will be asked; `data` may be cut behind it.
+
+        Raises:
+            DuagError: the bag is broken, or a message has no sound time.
+        """
         heads = [t for t in heads if foxglove.plain_name(self.topics[t].schema) not in foxglove.ROS_TYPES]
         with reading(self.path, "a sound bag of ROS 1 or ROS 2"):
             for connection, log_ns, raw in messages(self._reader, topics, heads):
@@ -180,7 +197,15 @@ def _bound_chunks(reader: Any) -> None:
 
 @contextmanager
 def reading(path: Path, expected: str) -> Iterator[None]:
-    """Turn whatever a reader stumbles over in a broken file into one line."""
+    """Turn whatever a reader stumbles over in a broken file into one line.
+
+    Args:
+        path: of the file, for the error.
+        expected: what it should be, for the error.
+
+    Raises:
+        DuagError: the block raised an error of any other kind.
+    """
     try:
         yield
     except (DuagError, GeneratorExit):
@@ -190,12 +215,26 @@ def reading(path: Path, expected: str) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """What an error says, on one line; its kind if it says nothing."""
+    """What an error says, on one line; its kind if it says nothing.
+
+    Args:
+        error: any exception.
+
+    Returns:
+        At most 200 characters.
+    """
     return " ".join(str(error).rstrip(".").split())[:200] or type(error).__name__
 
 
 def check_definitions(found: Mapping[str, Any]) -> None:
-    """Refuse a log that defines types that are read here otherwise than ROS does. found: fields by type."""
+    """Refuse a log that defines types that are read here otherwise than ROS does.
+
+    Args:
+        found: fields by type, as rosbags has them.
+
+    Raises:
+        ValueError: a type has other fields.
+    """
     from rosbags.typesys import Stores, get_typestore
 
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
@@ -211,7 +250,17 @@ def check_definitions(found: Mapping[str, Any]) -> None:
 
 
 def deserialized(read: Any, raw: bytes, kind: str, where: str) -> Any:
-    """A message of ROS from its bytes, or an error that names its topic."""
+    """A message of ROS from its bytes, or an error that names its topic.
+
+    Args:
+        read: makes a message of bytes and the name of a type.
+        raw: the bytes.
+        kind: name of the type.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: the bytes are no message of that type.
+    """
     try:
         return read(raw, kind)
     except Exception as error:  # whatever broken bytes provoke
@@ -219,7 +268,16 @@ def deserialized(read: Any, raw: bytes, kind: str, where: str) -> Any:
 
 
 def ros_header_ns(raw: bytes, encoding: str, where: str) -> int:
-    """Stamp of a message that begins with a header, without reading the rest."""
+    """Stamp (ns) of a message that begins with a header, without reading the rest.
+
+    Args:
+        raw: the message, at least its first bytes.
+        encoding: "cdr" or "ros1".
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: there are too few bytes.
+    """
     try:
         if encoding == "cdr":
             order = "<" if raw[1] & 1 else ">"

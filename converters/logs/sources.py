@@ -129,7 +129,11 @@ def _filled(settings: LogOptions, space: str) -> LogOptions:
 
 
 def robot_of(namespace: str) -> str:
-    """The name of a robot by its namespace: "/Husky-1" is husky_1."""
+    """The name of a robot by its namespace: "/Husky-1" is husky_1.
+
+    Args:
+        namespace: with or without a slash before it.
+    """
     name = re.sub(r"[^a-z0-9_]", "_", namespace.lower().strip("/"))
     return name if name[:1].isalpha() else f"robot_{name}"
 
@@ -185,7 +189,11 @@ def _check_names(table: Mapping[str, Any], where: str, *more: str) -> None:
 
 
 def logs_in(src: Path) -> list[Path]:
-    """All logs of a folder, or the log itself, in the order of the numbers in their names."""
+    """All logs of a folder, or the log itself, in the order of the numbers in their names.
+
+    Args:
+        src: a folder, or one log.
+    """
     return [path for group in _groups(src).values() for path in group]
 
 
@@ -289,7 +297,11 @@ def _numbered(source: Source) -> tuple[str, int]:
 
 
 def is_log(path: Path) -> bool:
-    """Whether a path is one log, by its name: a file, or a folder of `ros2 bag`."""
+    """Whether a path is one log, by its name: a file, or a folder of `ros2 bag`.
+
+    Args:
+        path: need not exist.
+    """
     if path.is_file():
         return path.suffix in SUFFIXES and not path.name.startswith(".")
     return (path / "metadata.yaml").is_file()

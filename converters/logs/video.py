@@ -33,7 +33,11 @@ _SKIPPED_UNITS = {"h264": range(0), "h265": range(8, 10)}
 
 
 def is_video(kind: str) -> bool:
-    """Whether messages of a type are packets of video; the type is ROS's name of it."""
+    """Whether messages of a type are packets of video.
+
+    Args:
+        kind: ROS's name of the type.
+    """
     return kind.endswith(("/CompressedVideo", "/FFMPEGPacket"))
 
 

@@ -37,13 +37,26 @@ class Mover:
     poses: Array
 
     def renderer(self, camera: PinholeCamera) -> MeshRenderer:
-        """A renderer of the figure alone."""
+        """A renderer of the figure alone.
+
+        Args:
+            camera: of the views.
+        """
         return MeshRenderer(Caster(meshes.load(self.folder)), camera)
 
     def near(
         self, T_world_mover: Array, origins: Array, directions: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
-        """Which rays [n, 3] pass its middle so near that they may meet it."""
+        """Which rays pass its middle so near that they may meet it.
+
+        Args:
+            T_world_mover: pose of the figure, [4, 4].
+            origins: [n, 3], meters, world frame.
+            directions: [n, 3], world frame, of any length.
+
+        Returns:
+            Boolean [n].
+        """
         to = T_world_mover[:3, 3] + np.array([0, 0, TALL_M / 2]) - origins
         along = np.einsum("ij,ij->i", to, directions)
         length2 = np.einsum("ij,ij->i", directions, directions)

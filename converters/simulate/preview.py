@@ -50,7 +50,13 @@ class Preview:
         self._thumbs: dict[tuple[str, int], Image] = {}
 
     def add(self, robot: str, index: int, png: bytes) -> None:
-        """Keep a frame, if it is one of those that are shown."""
+        """Keep a frame, if it is one of those that are shown.
+
+        Args:
+            robot: its name.
+            index: of the frame, counted from 0 along the trajectory.
+            png: the color image, encoded.
+        """
         if index in self.shown[robot]:
             image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
             assert image is not None
@@ -59,7 +65,13 @@ class Preview:
             self._thumbs[robot, index] = np.asarray(small[..., ::-1], dtype=np.uint8)
 
     def write(self, path: Path, points: Array, colors: NDArray[np.uint8]) -> None:
-        """Write the sheet; `points` [n, 3] (m, world) and their colors [n, 3] are the scene for the map."""
+        """Write the sheet.
+
+        Args:
+            path: the PNG file to write.
+            points: [n, 3], meters, world frame, the scene for the map.
+            colors: [n, 3], RGB, of the points.
+        """
         rows = [self._map(points, colors)] + [self._row(k) for k in range(len(self.names))]
         width = max(row.shape[1] for row in rows)
         sheet = [_line(self.title, width)]

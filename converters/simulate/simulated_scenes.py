@@ -31,13 +31,28 @@ class SimulatedScene(walks.Terrain, Protocol):
     depth_scale_m: float
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
-        """Paths T_world_camera [frames, 4, 4] of every robot, of no particular figure."""
+        """Paths T_world_camera [frames, 4, 4] of every robot, of no particular figure.
+
+        Args:
+            robots: how many.
+            frames: poses per robot, one step of the scene apart.
+            overlap: share, 0 to 1, of what a robot sees that the one before sees as well; met as nearly as
+                may be.
+            camera: of all robots.
+
+        Raises:
+            DuagError: no paths are found that keep clear.
+        """
 
     def points(self) -> Points:
         """Points spread evenly over the surfaces: positions (m, world), unit normals, colors, [n, 3] each."""
 
     def store(self, folder: Path) -> "SceneOnDisk":
-        """Write what other processes need."""
+        """Write what other processes need.
+
+        Args:
+            folder: where the files of the scene are written; exists.
+        """
 
 
 class SceneOnDisk(Protocol):
@@ -111,17 +126,44 @@ class SimulatedRoom:
         return self._baked.result()
 
     def store(self, folder: Path) -> RoomOnDisk:
+        """Write the baked texture.
+
+        Args:
+            folder: where the files of the scene are written; exists.
+        """
         for k, level in enumerate(self.atlas.levels):
             save_array(folder / f"{k}.npy", level)
         return RoomOnDisk(self.scene.seed, folder, len(self.atlas.levels), self.atlas.origin)
 
     def renderer(self, camera: PinholeCamera) -> CameraRenderer:
+        """A renderer with exact depth.
+
+        Args:
+            camera: of the views.
+        """
         return Renderer(self.scene, self.atlas, camera)
 
     def sketch_renderer(self, camera: PinholeCamera) -> CameraRenderer:
+        """A renderer for depth alone, of the room's triangles.
+
+        Args:
+            camera: of the views.
+        """
         return MeshRenderer(Caster(triangles.unpainted(self.scene)), camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
+        """Loops around the room, T_world_camera [frames, 4, 4] of every robot; see `loops.plan`.
+
+        Args:
+            robots: how many.
+            frames: poses per robot, one step of the scene apart.
+            overlap: share, 0 to 1, of what a robot sees that the one before sees as well; met as nearly as
+                may be.
+            camera: of all robots.
+
+        Raises:
+            DuagError: no paths are found that keep clear.
+        """
         return loops.plan(self.scene, robots, frames, overlap, camera=camera)
 
     def free_space(self) -> walks.WalkableSpace:
@@ -131,6 +173,11 @@ class SimulatedRoom:
         return walks.space_between(np.zeros(2), self.scene.size[:2], 0.0, self.clearance, closed=closed)
 
     def clearance(self, points: Array) -> Array:
+        """Distance (m) of points to the nearest surface, [...]; negative outside the room or in a solid.
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
         return self.scene.clearance(points)
 
     def points(self) -> Points:
@@ -168,16 +215,42 @@ class SimulatedMeshes:
         self._space: walks.WalkableSpace | None = None
 
     def store(self, folder: Path) -> MeshesOnDisk:
-        """Everything is on disk already."""
+        """Everything is on disk already.
+
+        Args:
+            folder: not used.
+        """
         return MeshesOnDisk(self.seed, self.folder, self.settings)
 
     def renderer(self, camera: PinholeCamera) -> CameraRenderer:
+        """A renderer of the triangles.
+
+        Args:
+            camera: of the views.
+        """
         return MeshRenderer(self.caster, camera, self.sky)
 
     def sketch_renderer(self, camera: PinholeCamera) -> CameraRenderer:
+        """The same renderer: there is no quicker one.
+
+        Args:
+            camera: of the views.
+        """
         return self.renderer(camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
+        """Walks T_world_camera [frames, 4, 4] of every robot; see `walks.plan`.
+
+        Args:
+            robots: how many.
+            frames: poses per robot, one step of the scene apart.
+            overlap: share, 0 to 1, of what a robot sees that the one before sees as well; met as nearly as
+                may be.
+            camera: of all robots.
+
+        Raises:
+            DuagError: no walks are found that keep clear and see something.
+        """
         return walks.plan(self, robots, frames, overlap, camera=camera, seed=self.seed)
 
     def free_space(self) -> walks.WalkableSpace:
@@ -186,6 +259,11 @@ class SimulatedMeshes:
         return self._space
 
     def clearance(self, points: Array) -> Array:
+        """Distance (m) of points to the nearest surface, [...].
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
         return self.caster.clearance(points)
 
     def points(self) -> Points:

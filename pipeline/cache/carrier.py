@@ -25,6 +25,11 @@ class NotStoredError(Exception):
     """A stage would have to be computed."""
 
     def __init__(self, key: StageKey) -> None:
+        """Initialize.
+
+        Args:
+            key: of the stage that the store does not have.
+        """
         super().__init__(label(key.stage, key.robot))
         self.key = key
 

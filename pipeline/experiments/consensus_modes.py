@@ -95,6 +95,12 @@ class Team:
 
     @staticmethod
     def made(case: dict[str, Any], plan: ConsensusPlan) -> Team:
+        """A team with evidence drawn at random, around a truth that all its robots share.
+
+        Args:
+            case: of `ConsensusPlan.cases`.
+            plan: number of tracks, and the seed.
+        """
         names = [f"robot_{k}" for k in range(case["robots"])]
         link = LinkConfig(topology=case["topology"])
         theta, weights = {}, {}
@@ -120,7 +126,11 @@ class Team:
         return Team(self.names, self.linked, self.theta, weights)
 
     def gaps_sigma(self, values: dict[str, Array]) -> Array:
-        """Largest distance of a coordinate from the optimum by track and robot, in its standard deviations."""
+        """Largest distance of a coordinate from the optimum, in its standard deviations, [robots, tracks].
+
+        Args:
+            values: [tracks, 13] by robot.
+        """
         return np.stack([np.max(np.abs(x - self.best) * self.roots, axis=1) for x in values.values()])
 
 
@@ -147,12 +157,22 @@ class _Cost:
 
 
 def run(plan: ConsensusPlan) -> dict[str, Any]:
-    """Measure made teams; see `ConsensusPlan`. One row per case: times are CPU time of all robots together."""
+    """Measure made teams. One row per case: times are CPU time of all robots together.
+
+    Args:
+        plan: the cases, number of tracks and limits.
+    """
     return _measured(plan, ((case, Team.made(case, plan)) for case in plan.cases()), len(plan.cases()))
 
 
 def run_on(team: Team, topology: str, plan: ConsensusPlan) -> dict[str, Any]:
-    """The same on evidence that is there, over links of a topology, for every loss and mode of the plan."""
+    """The same on evidence that is there, for every loss and mode of the plan.
+
+    Args:
+        team: with its evidence.
+        topology: of the links, as it is named in the rows.
+        plan: losses, modes and limits; the number of tracks is that of the team.
+    """
     weights = np.stack([w.diagonal() for w in team.weights.values()])
     known = weights[weights > 0]
     case = {
@@ -346,7 +366,11 @@ of its weights. kB: of all robots, headers and lost packets too; as the paper co
 
 
 def format_table(result: dict[str, Any]) -> str:
-    """The rows as a Markdown table that can be read as it stands, and what its columns mean."""
+    """The rows as a Markdown table that can be read as it stands, and what its columns mean.
+
+    Args:
+        result: of `run` or `run_on`.
+    """
     rows: list[list[object]] = []
     for r in result["rows"]:
         paper = r["bytes_paper_accounting"]

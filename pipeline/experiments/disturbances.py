@@ -52,7 +52,14 @@ Disturbance = Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]]
 def first(
     frames: int,
 ) -> Callable[[Callable[[int, Sequence[Shot], np.random.Generator], Shot]], Disturbance]:
-    """Make a disturbance of the first frames from what becomes of frame k."""
+    """Make a disturbance of the first frames from what becomes of frame k.
+
+    The decorated function takes the index k of a frame among the undisturbed ones, all of these, and a
+    source of noise; it returns the disturbed frame.
+
+    Args:
+        frames: how many are disturbed.
+    """
 
     def of(becomes: Callable[[int, Sequence[Shot], np.random.Generator], Shot]) -> Disturbance:
         @functools.wraps(becomes)
@@ -66,7 +73,12 @@ def first(
 
 
 def exposed(shot: Shot, gain: float) -> Shot:
-    """With `gain` times the light; bright pixels saturate."""
+    """With more or less light; bright pixels saturate.
+
+    Args:
+        shot: the frame.
+        gain: factor of the image values.
+    """
     return replace(shot, color=np.clip(gain * shot.color.astype(np.float32), 0, 255).astype(np.uint8))
 
 
@@ -87,7 +99,11 @@ def hand(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
 
 
 def foreign(other: Sequence[Shot]) -> Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]]:
-    """For 30 frames the images come from another room, in which a camera moves as well."""
+    """For 30 frames the images come from another room, in which a camera moves as well.
+
+    Args:
+        other: frames of the other room, of the same size.
+    """
 
     def foreign_room(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
         for k, shot in enumerate(shots):
@@ -111,7 +127,12 @@ def mirrored(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
 
 
 def dropped(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
-    """Every second frame is missing."""
+    """Every second frame is missing.
+
+    Args:
+        shots: the undisturbed frames.
+        rng: not used.
+    """
     yield from (replace(shot, disturbed=True) for shot in shots[1::2])
 
 
@@ -151,7 +172,12 @@ def blurred(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
 
 
 def passer(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
-    """In 30 frames something patterned, half as wide as the view and 1 m away, crosses it from left to right."""
+    """In 30 frames something patterned, half as wide as the view and 1 m away, crosses it from left to right.
+
+    Args:
+        shots: the undisturbed frames.
+        rng: source of the pattern.
+    """
     h, w = shots[0].depth.shape
     pattern = rng.integers(20, 236, (h // 16 + 1, w // 32 + 1, 3), dtype=np.uint8)
     pattern = np.asarray(cv2.resize(pattern, (w // 2, h), interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
@@ -207,7 +233,12 @@ def paused(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
 
 
 def odd_stamps(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
-    """For 30 frames every third stamp comes 30 ms late, just before the next; then the clock jumps by ten seconds."""
+    """For 30 frames every third stamp is 30 ms late, just before the next; then the clock jumps by 10 s.
+
+    Args:
+        shots: the undisturbed frames.
+        rng: not used.
+    """
     for k, shot in enumerate(shots):
         later_ns = (30_000_000 if k % 3 == 0 else 0) if k < 30 else 10_000_000_000
         yield replace(shot, stamp_ns=shot.stamp_ns + later_ns, disturbed=k <= 30)

@@ -124,7 +124,11 @@ class GaussianPacket:
     values: NDArray[np.floating] | None
 
     def parts(self, room_bytes: int) -> Iterator[GaussianPacket]:
-        """The same in parts of at most so many bytes, each useful alone."""
+        """The same in parts of limited size, each useful alone.
+
+        Args:
+            room_bytes: most bytes of the arrays of a part; a part has at least one row.
+        """
         arrays = [a for a in (self.weights, self.values) if a is not None]
         rows = len(arrays[0]) if arrays else 0
         step = max(1, room_bytes // max(1, sum(a.itemsize * COORDINATES for a in arrays)))
@@ -192,7 +196,11 @@ class GaussianAgent:
         """The values now, [n, 13]."""
 
     def outgoing(self, peer: str) -> GaussianPacket:
-        """What to send to a neighbor in this round."""
+        """What to send to a neighbor in this round.
+
+        Args:
+            peer: name of the neighbor.
+        """
         link = self._links[peer]
         self._sequence += 1
         values: NDArray[np.floating] | None = None
@@ -203,7 +211,12 @@ class GaussianAgent:
         return GaussianPacket(self._sequence, 0, weights, link.edge is not None, values)
 
     def receive(self, peer: str, packet: GaussianPacket) -> None:
-        """Take a packet of a neighbor, or a part of one; where a later value came before, it is not used."""
+        """Take a packet of a neighbor, or a part of one; where a later value came before, it is not used.
+
+        Args:
+            peer: name of the neighbor.
+            packet: rows of the tracks that both share, in their order.
+        """
         link = self._links[peer]
         link.peer_has_weights |= packet.has_weights
         if packet.weights is not None and link.edge is None:
@@ -281,7 +294,13 @@ def optimum(theta: Sequence[Array], weights: Sequence[Weights], rows: Sequence[I
 
 
 def total_weights(weights: Sequence[Weights], rows: Sequence[Index], tracks: int) -> Weights:
-    """Sum of all robots' weights per track."""
+    """Sum of all robots' weights per track.
+
+    Args:
+        weights: of the rows of each robot.
+        rows: track of every row of each robot; a robot has a track once.
+        tracks: how many.
+    """
     total = Weights.of_diagonal(np.zeros((tracks, COORDINATES)))
     for w, at in zip(weights, rows, strict=True):
         total.position[at] += w.position

@@ -238,7 +238,11 @@ def _agreement(
 
 
 def format_table(result: dict[str, Any]) -> str:
-    """One line per trajectory, millimeters."""
+    """One line per trajectory, millimeters.
+
+    Args:
+        result: of `run`.
+    """
     cuts = list(result["rows"][0]["cut_ate_rmse_m"])
     head = ["poses", "one alignment", "own alignments", *(f"cut in {n}" for n in cuts)]
     head += [f"depth images {kind} ({pairs} pairs)" for kind, pairs in result["views"].items() if pairs]

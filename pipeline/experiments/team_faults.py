@@ -53,7 +53,17 @@ class TeamBench:
     """A run's team, ready to meet again and again."""
 
     def __init__(self, run: RunFolder, recording: Recording, config: ExchangeConfig, seed: int) -> None:
-        """config, seed: those of the run."""
+        """Initialize.
+
+        Args:
+            run: a finished run.
+            recording: that the run was made of.
+            config: of the run's exchange.
+            seed: of the run.
+
+        Raises:
+            DuagError: the run has one robot, or a robot has no ground truth.
+        """
         if len(run.robots) < 2:
             raise DuagError(f"{run.path}: has one robot, expected two or more")
         self.run, self.config, self.seed = run, config, seed
@@ -68,7 +78,11 @@ class TeamBench:
             self.truth[robot] = true
 
     def measure(self, session: FaultySession) -> dict[str, Any]:
-        """Let the team meet and measure the result."""
+        """Let the team meet and measure the result; lengths in meters.
+
+        Args:
+            session: data, settings and seed.
+        """
         with tempfile.TemporaryDirectory(prefix="duagc-bench-") as folder:
             exchange = Path(folder) / "exchange.mcap"
             results = run_session_of(
@@ -118,19 +132,33 @@ class TeamBench:
     # --- what is tried
 
     def session(self, name: str, seed: int | None = None, **changes: Any) -> FaultySession:
-        """The run's own exchange with some settings changed."""
+        """The run's own exchange with some settings changed.
+
+        Args:
+            name: of the case.
+            seed: of the session; None: that of the run.
+            changes: settings of the exchange by name.
+        """
         config = self.config.model_copy(update=changes)
         same = {d.robot: d.robot for d in self.data}
         return FaultySession(name, self.data, config, self.seed if seed is None else seed, same)
 
     def frames(self, seeds: int) -> Iterator[FaultySession]:
-        """Every map in a frame of its own, drawn anew."""
+        """Every map in a frame of its own, drawn anew.
+
+        Args:
+            seeds: how many times.
+        """
         for seed in range(seeds):
             base = self.session("frames")
             yield replace(base, data=[moved(d, seed) for d in self.data])
 
     def names(self, seeds: int) -> Iterator[FaultySession]:
-        """The robots under each other's names."""
+        """The robots under each other's names.
+
+        Args:
+            seeds: not used.
+        """
         names = [d.robot for d in self.data]
         for order in itertools.islice(itertools.permutations(names), 1, MOST_ORDERS):
             new = dict(zip(names, order, strict=True))
@@ -138,24 +166,40 @@ class TeamBench:
             yield replace(base, data=[renamed(d, new[d.robot]) for d in self.data], names=new)
 
     def closures(self, seeds: int) -> Iterator[FaultySession]:
-        """False closures among the true ones."""
+        """False closures among the true ones.
+
+        Args:
+            seeds: how many times, each with other false closures.
+        """
         faults = self.config.injection.model_copy(update={"false_closures": FALSE_CLOSURES})
         for seed in range(seeds):
             yield self.session("closures", seed, injection=faults)
 
     def loss(self, seeds: int) -> Iterator[FaultySession]:
-        """Packets lost independently; as many rounds as it takes."""
+        """Packets lost independently; as many rounds as it takes.
+
+        Args:
+            seeds: how many times at each loss.
+        """
         for loss in LOSSES:
             for seed in range(seeds):
                 link = self.config.link.model_copy(update={"loss_probability": loss})
                 yield self.session(f"loss {loss:g}", seed, link=link, max_rounds=20_000)
 
     def silence(self, seeds: int) -> Iterator[FaultySession]:
-        """Everything is lost."""
+        """Everything is lost.
+
+        Args:
+            seeds: not used.
+        """
         yield self.session("silence", link=self.config.link.model_copy(update={"loss_probability": 1.0}))
 
     def solver(self, seeds: int) -> Iterator[FaultySession]:
-        """The other solver of the poses."""
+        """The other solver of the poses.
+
+        Args:
+            seeds: not used.
+        """
         other = "elimination" if self.config.solver == "admm" else "admm"
         yield self.session(other, solver=other)
 
@@ -204,7 +248,11 @@ def run(
 
 
 def thinned(data: RobotData) -> RobotData:
-    """The same robot with few of its Gaussians, evenly spread."""
+    """The same robot with few of its Gaussians, evenly spread.
+
+    Args:
+        data: of a robot.
+    """
     count = len(data.gaussians)
     keep = np.unique(np.linspace(0, count - 1, min(count, GAUSSIANS)).astype(np.int64))
     i = data.information
@@ -221,7 +269,12 @@ def thinned(data: RobotData) -> RobotData:
 
 
 def moved(data: RobotData, seed: int) -> RobotData:
-    """The same robot with another map frame."""
+    """The same robot with another map frame.
+
+    Args:
+        data: of a robot.
+        seed: of the frame's offset and rotation.
+    """
     rng = random_streams.generator(seed, "bench.map_frame", robot=data.robot)
     offset = MAP_OFFSET_M * rng.normal(size=(1, 3))
     T = se3.from_quat_translation(rng.normal(size=(1, 4)), offset) @ data.T_map_keyframe
@@ -229,7 +282,12 @@ def moved(data: RobotData, seed: int) -> RobotData:
 
 
 def renamed(data: RobotData, name: str) -> RobotData:
-    """The same robot under another name."""
+    """The same robot under another name.
+
+    Args:
+        data: of a robot.
+        name: the other name.
+    """
     return replace(data, robot=name, information=replace(data.information, robot=name))
 
 
@@ -240,7 +298,11 @@ def _input(run: RunFolder, recording: Recording, robot: str) -> AgentInput:
 
 
 def format_table(result: dict[str, Any]) -> str:
-    """One line per session, then the worst of every case."""
+    """One line per session, then the worst of every case.
+
+    Args:
+        result: of `run`.
+    """
     head = ["case", "seed", "together", "team ATE, mm", "rounds", "MB", "closures", "false kept", "alone"]
     rows = []
     for row in [result["base"], *result["rows"]]:

@@ -22,9 +22,13 @@ from duagc.pipeline.splat.information import LOG_COVARIANCE, pack_information
 
 
 def team_of_run(run: RunFolder, topology: str) -> Team:
-    """What the robots of the largest component know of their tracks, in the world, linked by a topology.
+    """What the robots of the largest component know of their tracks, in the world.
 
     With the variance of sampling as fusion expects it, every member's alike.
+
+    Args:
+        run: a finished run.
+        topology: of the links between the robots.
 
     Raises:
         DuagError: nothing was matched.

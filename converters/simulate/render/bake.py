@@ -43,7 +43,13 @@ class Atlas:
     texel_m: float
 
     def sample(self, level: int, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Colors [n, 3] between the texels of one level; x, y [n] in texels of the finest level."""
+        """Colors [n, 3] between the texels of one level.
+
+        Args:
+            level: index into `levels`; 0: the finest.
+            x: columns [n], in texels of the finest level.
+            y: rows [n], in texels of the finest level.
+        """
         n, row = len(x), 1024
         if n == 0:
             return np.zeros((0, 3), dtype=np.uint8)
@@ -63,7 +69,14 @@ Blocked = Callable[[Array, Array], NDArray[np.bool_]]
 
 
 def bake(scene: Scene, texel_m: float, blocked: Blocked | None = None) -> Atlas:
-    """Paint and light all surfaces of a scene; without `blocked`, small things cast no shadow."""
+    """Paint and light all surfaces of a scene.
+
+    Args:
+        scene: the surfaces, solids and lamps.
+        texel_m: width of a texel, meters.
+        blocked: whether anything lies between points [n, 3] and points + offset [n, 3], world frame; None: by
+            the solids of the scene, and small things cast no shadow.
+    """
     shapes = [
         (int(np.ceil(surface.size[1] / texel_m)) + 1, int(np.ceil(surface.size[0] / texel_m)) + 1)
         for surface in scene.surfaces
@@ -141,7 +154,14 @@ def _lights(scene: Scene, blocked: Blocked | None) -> list[NDArray[np.float32]]:
 
 
 def exposure(scene: Scene, points: Array, normals: Array, blocked: Blocked | None = None) -> Array:
-    """Brightness of white at world points [n, 3] with unit normals [n, 3], tone-mapped, [n]."""
+    """Brightness of white at points of the world, tone-mapped, [n].
+
+    Args:
+        scene: with its lamps, sun and even light.
+        points: [n, 3], meters, world frame.
+        normals: [n, 3], unit length, world frame.
+        blocked: as in `bake`.
+    """
     start = points + 0.004 * normals
     total = scene.even_light * _ambient(scene, start, normals, blocked)
     if scene.sun is not None:
@@ -254,7 +274,13 @@ def _meets(solid: Solid, start: Array, offset: Array, reach: float) -> NDArray[n
 
 
 def surface_points(scene: Scene, atlas: Atlas, count: int) -> tuple[Array, Array, NDArray[np.uint8]]:
-    """About `count` points spread evenly over what can be seen of a scene: points, normals, colors, [n, 3] each."""
+    """Points spread evenly over what can be seen of a scene: points (m, world), normals, colors, [n, 3] each.
+
+    Args:
+        scene: the surfaces and solids.
+        atlas: colors of the surfaces.
+        count: about how many.
+    """
     rng = random_streams.generator(scene.seed, "simulate.points", scene=scene.name)
     bounds = np.array([_bounds(solid) for solid in scene.solids]).reshape(-1, 2, 3)
     areas = np.array([surface.size[0] * surface.size[1] for surface in scene.surfaces])

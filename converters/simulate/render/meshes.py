@@ -121,6 +121,9 @@ def _bilinear(levels: list[NDArray[np.uint8]], k: int, xy: NDArray[np.float32]) 
 def mesh_files(folder: Path) -> list[Path]:
     """The mesh files of a folder by name.
 
+    Args:
+        folder: with GLB, glTF, OBJ or PLY files.
+
     Raises:
         DuagError: there is no such folder, or no mesh in it.
     """
@@ -143,7 +146,14 @@ def _suffixes() -> str:
 
 
 def digests(files: list[Path]) -> dict[str, str]:
-    """SHA-256 of every file by its name."""
+    """SHA-256 of every file by its name.
+
+    Args:
+        files: paths of the meshes.
+
+    Raises:
+        DuagError: a file cannot be read.
+    """
     try:
         return {path.name: digest_of_bytes(path) for path in files}
     except OSError as error:
@@ -165,6 +175,10 @@ def check_up(up: str) -> None:
 
 def up_axis(files: list[Path], up: str) -> str:
     """ "y" or "z": what was asked for, or the custom of the format.
+
+    Args:
+        files: paths of the meshes.
+        up: "y", "z" or "auto": by the custom of the format.
 
     Raises:
         DuagError: the files are of formats with different customs.
@@ -197,7 +211,11 @@ def read(folder: Path, up: str, cache: Path) -> MeshScene:
 
 
 def load(cache: Path) -> MeshScene:
-    """The scene that `read` has written into a folder, mapped into memory."""
+    """The scene that `read` has written into a folder, mapped into memory.
+
+    Args:
+        cache: the folder.
+    """
     arrays = {name: np.asarray(np.load(cache / f"{name}.npy", mmap_mode="r")) for name in ARRAYS}
     textures: list[list[NDArray[np.uint8]]] = []
     while (cache / texture_file(len(textures), 0)).exists():
@@ -209,9 +227,15 @@ def load(cache: Path) -> MeshScene:
 def surface_points(
     scene: MeshScene, areas: Array, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array, NDArray[np.uint8]]:
-    """`count` points spread evenly over the triangles: points (m), unit normals, colors, [n, 3] each.
+    """Points spread evenly over the triangles: points (m, world), unit normals, colors (RGB), [n, 3] each.
 
     A normal points to the side from which the corners run counter-clockwise.
+
+    Args:
+        scene: the triangles and their textures.
+        areas: of the triangles, [m], square meters.
+        count: how many points; those that fall on triangles without area are left out.
+        rng: source of the positions.
     """
     share = np.cumsum(areas) / areas.sum()
     triangle = np.searchsorted(share, (np.arange(count) + rng.random(count)) / count).clip(0, len(areas) - 1)

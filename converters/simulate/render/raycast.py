@@ -26,6 +26,11 @@ class Caster:
     """Rays through a scene and distances to it, on one thread: the same numbers whatever the machine does besides."""
 
     def __init__(self, scene: MeshScene) -> None:
+        """Initialize.
+
+        Args:
+            scene: the triangles that rays meet.
+        """
         o3d = import_open3d()
         self.scene = scene
         self._tensor = o3d.core.Tensor.from_numpy
@@ -35,7 +40,11 @@ class Caster:
         )
 
     def hits(self, origins: Array, directions: NDArray[np.floating]) -> dict[str, NDArray]:
-        """Where rays [n, 3] first meet the scene.
+        """Where rays first meet the scene.
+
+        Args:
+            origins: [n, 3] or [3], meters, world frame.
+            directions: [n, 3], world frame, of any length.
 
         Returns:
             t [n], in lengths of the direction, inf = nothing; triangle [n]; weights [n, 2] of its second and third
@@ -52,13 +61,22 @@ class Caster:
         }
 
     def blocked(self, start: Array, offset: Array) -> NDArray[np.bool_]:
-        """Whether anything lies between start [n, 3] and start + offset [n, 3]."""
+        """Whether anything lies between points and points with an offset, [n].
+
+        Args:
+            start: [n, 3], meters, world frame.
+            offset: [n, 3], meters, world frame.
+        """
         rays = np.concatenate([start, offset], axis=1).astype(np.float32)
         hidden = self._embree.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0, nthreads=1)
         return np.asarray(hidden.numpy(), dtype=np.bool_)
 
     def clearance(self, points: Array) -> Array:
-        """Distance (m) of world points [..., 3] to the nearest surface."""
+        """Distance (m) of points to the nearest surface, [...].
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
         flat = np.asarray(points).reshape(-1, 3).astype(np.float32)
         distance = self._embree.compute_distance(self._tensor(flat), nthreads=1).numpy()
         return distance.astype(np.float64).reshape(np.shape(points)[:-1])
@@ -68,11 +86,22 @@ class MeshRenderer:
     """Renders a scene of meshes with one camera."""
 
     def __init__(self, caster: Caster, camera: PinholeCamera, sky: bool = False) -> None:
+        """Initialize.
+
+        Args:
+            caster: rays through the scene.
+            camera: of the images.
+            sky: whether rays that meet nothing see a sky; else they see black.
+        """
         self.caster, self.scene, self.camera, self.sky = caster, caster.scene, camera, sky
         self._texel_density = _texel_density(self.scene)
 
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
-        """Depth (z, m, [h, w]; 0 = nothing) and triangle seen (-1 = nothing) at the pixel centers."""
+        """Depth (z, m, [h, w]; 0 = nothing) and triangle seen (-1 = nothing) at the pixel centers.
+
+        Args:
+            T_world_camera: camera pose, [4, 4].
+        """
         T = np.asarray(T_world_camera, dtype=np.float64)
         hit = self.caster.hits(T[:3, 3], self._directions(T, 0.0, 0.0))
         seen = np.isfinite(hit["t"])
@@ -82,7 +111,11 @@ class MeshRenderer:
         return depth.reshape(shape), triangle.reshape(shape)
 
     def render(self, T_world_camera: ArrayLike) -> RenderedView:
-        """Color and depth from a camera pose T_world_camera [4, 4]."""
+        """Color and depth from a camera pose.
+
+        Args:
+            T_world_camera: camera pose, [4, 4].
+        """
         depth, triangle = self.depth(T_world_camera)
         T = np.asarray(T_world_camera, dtype=np.float64)
         directions = [self._directions(T, *offset) for offset in OFFSETS]
@@ -99,7 +132,12 @@ class MeshRenderer:
     def shade(
         self, origins: Array, directions: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """What rays [n, 3], one meter along z, half a pixel apart, meet: z [n], inf = nothing; colors [n, 3]."""
+        """What rays, half a pixel apart, meet: z [n], meters, inf = nothing; colors [n, 3], 0 to 255.
+
+        Args:
+            origins: [n, 3] or [3], meters, world frame.
+            directions: [n, 3], world frame; z counts their lengths (a meter along the optical axis).
+        """
         hit = self.caster.hits(origins, directions)
         t = hit["t"].copy()
         missed = np.flatnonzero(~np.isfinite(t))
@@ -140,7 +178,11 @@ class MeshRenderer:
 
 
 def sky_color(directions: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Colors [n, 3], 0 to 255, of the sky in world directions [n, 3]: paler at the horizon, with a few clouds."""
+    """Colors [n, 3], RGB, 0 to 255, of the sky: paler at the horizon, with a few clouds.
+
+    Args:
+        directions: [n, 3], world frame, of any length.
+    """
     d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     height = np.clip(d[:, 2], 0.0, 1.0)[:, None]
     blue = np.array((214, 224, 234)) * (1 - height) ** 2 + np.array((92, 144, 206)) * (1 - (1 - height) ** 2)

@@ -53,10 +53,18 @@ class CameraRenderer(Protocol):
     camera: PinholeCamera
 
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, Any]:
-        """Depth (z, m, [h, w]; 0 = nothing) at the pixel centers, and what is seen there (-1 = nothing)."""
+        """Depth (z, m, [h, w]; 0 = nothing) at the pixel centers, and what is seen there (-1 = nothing).
+
+        Args:
+            T_world_camera: camera pose, [4, 4].
+        """
 
     def render(self, T_world_camera: ArrayLike) -> RenderedView:
-        """Color and depth from a camera pose T_world_camera [4, 4]."""
+        """Color and depth from a camera pose.
+
+        Args:
+            T_world_camera: camera pose, [4, 4].
+        """
 
 
 class Renderer:
@@ -80,14 +88,22 @@ class Renderer:
         self.v = np.arange(camera.height, dtype=np.float64)
 
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, NDArray[np.int16]]:
-        """Exact depth (z, m, [h, w]; 0 = nothing) and index of the surface seen (-1 = nothing) at pixel centers."""
+        """Exact depth (z, m, [h, w]; 0 = nothing) and index of the surface seen (-1 = none) at pixel centers.
+
+        Args:
+            T_world_camera: camera pose, [4, 4].
+        """
         inverse, surface = self._nearest(SurfacesFromPose(self.scene, self.camera, T_world_camera))
         depth = np.zeros_like(inverse)
         np.divide(1.0, inverse, out=depth, where=inverse > 0)
         return depth, surface
 
     def render(self, T_world_camera: ArrayLike) -> RenderedView:
-        """Color and exact depth from a camera pose T_world_camera [4, 4]."""
+        """Color and exact depth from a camera pose.
+
+        Args:
+            T_world_camera: camera pose, [4, 4].
+        """
         pose = SurfacesFromPose(self.scene, self.camera, T_world_camera)
         inverse, surface = self._nearest(pose)
         depth = np.zeros_like(inverse)

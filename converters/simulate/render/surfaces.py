@@ -127,7 +127,13 @@ class SurfacesFromPose:
         ]
 
     def curved(self, k: int, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array, Array]:
-        """Inverse depth (0 where missed) and surface coordinates of curved surface k at pixels of any shape."""
+        """Inverse depth (1/m, 0 where missed) and coordinates (s, t, m) of a curved surface at pixels.
+
+        Args:
+            k: index of the surface in the scene.
+            u: columns [...].
+            v: rows [...].
+        """
         surface = self.scene.surfaces[k]
         pixels = np.stack([np.asarray(u, dtype=np.float64), np.asarray(v), np.ones(np.shape(u))], axis=-1)
         d = pixels @ self.rays.T

@@ -15,7 +15,13 @@ SIDES = 48  # of a cylinder, a disc and the equator of a sphere; no coarser than
 
 
 def write(scene: Scene, texel_m: float, cache: Path) -> None:
-    """Write a scene into an empty folder, to be read by `meshes.load`; its texture has texels of `texel_m`."""
+    """Write a scene into a folder, to be read by `meshes.load`.
+
+    Args:
+        scene: the surfaces and lamps.
+        texel_m: width of a texel of the texture, meters.
+        cache: an empty folder.
+    """
     vertices, coordinates, triangles, surface_of = _triangles(scene)
     atlas = bake.bake(scene, texel_m, Caster(unpainted(scene)).blocked)
     for k, level in enumerate(atlas.levels):
@@ -33,7 +39,11 @@ def write(scene: Scene, texel_m: float, cache: Path) -> None:
 
 
 def unpainted(scene: Scene) -> meshes.MeshScene:
-    """The geometry alone, black."""
+    """The geometry alone, black.
+
+    Args:
+        scene: the surfaces.
+    """
     vertices, _, triangles, _ = _triangles(scene)
     texels = np.zeros((len(triangles), 3, 2), dtype=np.float32)
     texture_of = np.full(len(triangles), meshes.NO_TEXTURE, dtype=np.int32)

@@ -26,7 +26,11 @@ Rect = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 
 def office(seed: int) -> Scene:
-    """Six rooms on both sides of a corridor, 13.6 m x 10.4 m: desks, shelves, a meeting room, a lounge."""
+    """Six rooms on both sides of a corridor, 13.6 m x 10.4 m: desks, shelves, a meeting room, a lounge.
+
+    Args:
+        seed: of layout and textures.
+    """
     scene = Scene("office", seed, np.array([13.6, 10.4, 2.7]))
     rng = random_streams.generator(seed, "simulate.layout", scene="office")
     w, d, _ = scene.size.tolist()
@@ -55,7 +59,11 @@ def office(seed: int) -> Scene:
 
 
 def corridor(seed: int) -> Scene:
-    """A corridor 26 m long and 2.6 m wide, with a hall of 7 m x 7 m in its middle."""
+    """A corridor 26 m long and 2.6 m wide, with a hall of 7 m x 7 m in its middle.
+
+    Args:
+        seed: of layout and textures.
+    """
     scene = Scene("corridor", seed, np.array([26.0, 7.0, 2.9]))
     rng = random_streams.generator(seed, "simulate.layout", scene="corridor")
     w, d, h = scene.size.tolist()

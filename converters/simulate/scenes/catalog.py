@@ -41,6 +41,10 @@ SCENES: dict[str, tuple[Callable[[int], Scene], SceneSettings]] = {
 def build(name: str, seed: int) -> Scene:
     """Build a scene by its name.
 
+    Args:
+        name: one of `SCENES`.
+        seed: of layout and textures.
+
     Raises:
         DuagError: there is no scene of that name.
     """

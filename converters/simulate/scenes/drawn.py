@@ -7,7 +7,14 @@ from duagc.converters.simulate.scenes.textures import Image, Material, cloud, fl
 
 
 def picture(kind: str) -> Material:
-    """Something framed: an "abstract" painting, a "landscape", a "map" or a "page" of text."""
+    """Something framed.
+
+    Args:
+        kind: an "abstract" painting, a "landscape", a "map" or a "page" of text.
+
+    Raises:
+        KeyError: there is no such kind.
+    """
     painter = {"abstract": _abstract, "landscape": _landscape, "map": _map, "page": _page}[kind]
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
@@ -93,7 +100,14 @@ def _page(rng: np.random.Generator, h: int, w: int, texel_m: float) -> Image:
 
 
 def screen(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
-    """A display with windows of text and a chart."""
+    """A display with windows of text and a chart.
+
+    Args:
+        rng: source of the random choices.
+        width_m: width of the surface, meters.
+        height_m: height of the surface, meters.
+        texel_m: width of a texel, meters.
+    """
     h, w = shape_of(width_m, height_m, texel_m)
     image = _landscape(rng, h, w, texel_m) * np.float32(0.7)
     for _ in range(3):
@@ -113,7 +127,14 @@ def screen(rng: np.random.Generator, width_m: float, height_m: float, texel_m: f
 
 
 def window(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
-    """A bright view outside behind the bars of a window."""
+    """A bright view outside behind the bars of a window.
+
+    Args:
+        rng: source of the random choices.
+        width_m: width of the surface, meters.
+        height_m: height of the surface, meters.
+        texel_m: width of a texel, meters.
+    """
     h, w = shape_of(width_m, height_m, texel_m)
     image = 1.1 * _landscape(rng, h, w, texel_m) + 60
     bar = max(3, round(0.05 / texel_m))
@@ -131,7 +152,14 @@ BINDINGS = (
 
 
 def spines(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
-    """Books side by side, seen from their backs."""
+    """Books side by side, seen from their backs.
+
+    Args:
+        rng: source of the random choices.
+        width_m: width of the surface, meters.
+        height_m: height of the surface, meters.
+        texel_m: width of a texel, meters.
+    """
     h, w = shape_of(width_m, height_m, texel_m)
     image = flat((h, w), (24, 20, 18))
     x = 0.0
@@ -151,7 +179,14 @@ def spines(rng: np.random.Generator, width_m: float, height_m: float, texel_m: f
 
 
 def carton(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
-    """Cardboard with tape, a label and print."""
+    """Cardboard with tape, a label and print.
+
+    Args:
+        rng: source of the random choices.
+        width_m: width of the surface, meters.
+        height_m: height of the surface, meters.
+        texel_m: width of a texel, meters.
+    """
     h, w = shape_of(width_m, height_m, texel_m)
     image = flat((h, w), shaded(rng, (178, 140, 98), 0.05))
     image *= (1 + 0.06 * cloud(rng, (h, w), 0.08 / texel_m, 4, gain=0.8))[..., None]

@@ -35,7 +35,11 @@ class Place:
     yaw_rad: float = 0.0
 
     def world(self, point: ArrayLike) -> Array:
-        """World coordinates [3] of a point of the place."""
+        """World coordinates [3] of a point of the place.
+
+        Args:
+            point: [3], meters, in the axes of the place.
+        """
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         px, py, pz = np.asarray(point, dtype=np.float64)
         return np.array([self.x + c * px - s * py, self.y + s * px + c * py, pz])
@@ -50,7 +54,16 @@ class Place:
         yaw_rad: float = 0.0,
         **faces: Any,
     ) -> None:
-        """A box with its low corner at `low`, turned about its own middle; faces as in `Scene.box`."""
+        """A box, turned about its own middle.
+
+        Args:
+            name: appended to that of the place.
+            low: its low corner [3], meters, in the axes of the place.
+            size: along these axes [3], meters.
+            material: of all faces.
+            yaw_rad: turn against the axes of the place.
+            faces: materials of single faces, as in `Scene.box`.
+        """
         half = np.asarray(size, dtype=np.float64) / 2
         low_world = self.world(np.asarray(low, dtype=np.float64) + half) - half
         self.scene.box(
@@ -60,7 +73,15 @@ class Place:
     def legs(
         self, name: str, low: ArrayLike, size: ArrayLike, material: tex.Material, *, thick: float
     ) -> None:
-        """Four legs under the box [low, low + size]."""
+        """Four legs under a box.
+
+        Args:
+            name: appended to that of the place.
+            low: low corner of the box [3], meters, in the axes of the place.
+            size: of the box [3], meters; the legs are as high as it.
+            material: of the legs.
+            thick: width of a leg, meters.
+        """
         low, size = np.asarray(low, dtype=np.float64), np.asarray(size, dtype=np.float64)
         for i, (dx, dy) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
             corner = low + np.array([dx, dy, 0]) * (size - thick)
@@ -69,16 +90,36 @@ class Place:
     def cylinder(
         self, name: str, base: ArrayLike, material: tex.Material, *, radius: float, height: float
     ) -> None:
-        """An upright cylinder."""
+        """An upright cylinder.
+
+        Args:
+            name: appended to that of the place.
+            base: middle of its foot [3], meters, in the axes of the place.
+            material: of side and lid.
+            radius: meters.
+            height: meters.
+        """
         self.scene.cylinder(f"{self.name}/{name}", self.world(base), material, radius=radius, height=height)
 
     def sphere(self, name: str, center: ArrayLike, radius: float, material: tex.Material) -> None:
-        """A sphere."""
+        """A sphere.
+
+        Args:
+            name: appended to that of the place.
+            center: [3], meters, in the axes of the place.
+            radius: meters.
+            material: of its surface.
+        """
         self.scene.sphere(f"{self.name}/{name}", self.world(center), radius, material)
 
 
 def desk(at: Place, rng: np.random.Generator) -> None:
-    """A desk at the wall with a display, drawers, books, paper and a mug, and a chair before it."""
+    """A desk at the wall with a display, drawers, books, paper and a mug, and a chair before it.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+    """
     dark = tex.wood(DARK)
     at.box("top", (-0.75, -0.75, 0.71), (1.5, 0.75, 0.04), tex.wood(PINE))
     at.legs("leg", (-0.72, -0.72, 0), (1.44, 0.68, 0.71), dark, thick=0.06)
@@ -106,7 +147,13 @@ def desk(at: Place, rng: np.random.Generator) -> None:
 
 
 def chair(at: Place, rng: np.random.Generator, yaw_rad: float = 0.0) -> None:
-    """A chair that looks to the wall, its middle at the place."""
+    """A chair that looks to the wall, its middle at the place.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+        yaw_rad: turn against the axes of the place.
+    """
     cloth = tex.fabric(*CLOTHS[int(rng.integers(0, len(CLOTHS)))])
     own = Place(at.scene, at.name, at.x, at.y, at.yaw_rad + yaw_rad)
     own.box("seat", (-0.22, -0.22, 0.42), (0.44, 0.44, 0.06), cloth)
@@ -115,7 +162,14 @@ def chair(at: Place, rng: np.random.Generator, yaw_rad: float = 0.0) -> None:
 
 
 def shelf(at: Place, rng: np.random.Generator, width: float, height: float = 2.0) -> None:
-    """Boards with rows of books and boxes, open to the front."""
+    """Boards with rows of books and boxes, open to the front.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+        width: meters.
+        height: meters.
+    """
     oak, board, rows, depth = tex.wood((150, 106, 66)), 0.03, 5, 0.32
     at.box("back", (-width / 2, -0.02, 0), (width, 0.02, height), tex.wood((112, 78, 50)))
     for side, x in (("left", -width / 2), ("right", width / 2 - board)):
@@ -139,7 +193,14 @@ def shelf(at: Place, rng: np.random.Generator, width: float, height: float = 2.0
 
 
 def cabinet(at: Place, rng: np.random.Generator, width: float = 1.2, height: float = 0.88) -> None:
-    """Drawers with a few things on top."""
+    """Drawers with a few things on top.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+        width: meters.
+        height: meters.
+    """
     columns = max(2, round(width / 0.45))
     tone = tex.shaded(rng, (182, 160, 126), 0.12)
     at.box(
@@ -159,7 +220,13 @@ def cabinet(at: Place, rng: np.random.Generator, width: float = 1.2, height: flo
 
 
 def plant(at: Place, rng: np.random.Generator, high: float = 1.0) -> None:
-    """A plant in a pot, its middle at the place."""
+    """A plant in a pot, its middle at the place.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+        high: height of the middle of its leaves, meters.
+    """
     at.cylinder(
         "pot",
         (0, 0, 0),
@@ -172,13 +239,24 @@ def plant(at: Place, rng: np.random.Generator, high: float = 1.0) -> None:
 
 
 def cartons(at: Place, rng: np.random.Generator) -> None:
-    """Two boxes, one on the other, at the wall."""
+    """Two boxes, one on the other, at the wall.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+    """
     at.box("low", (-0.28, -0.58, 0), (0.55, 0.55, 0.42), drawn.carton)
     at.box("high", (-0.2, -0.5, 0.42), (0.38, 0.4, 0.3), drawn.carton, yaw_rad=float(rng.uniform(-0.5, 0.5)))
 
 
 def sofa(at: Place, rng: np.random.Generator, width: float = 1.7) -> None:
-    """A sofa at the wall with cushions."""
+    """A sofa at the wall with cushions.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+        width: of the seat, meters.
+    """
     cloth = tex.fabric(*CLOTHS[int(rng.integers(0, len(CLOTHS)))])
     at.box("seat", (-width / 2, -0.85, 0.1), (width, 0.63, 0.32), cloth)
     at.box("back", (-width / 2, -0.22, 0.1), (width, 0.22, 0.72), cloth)
@@ -191,7 +269,13 @@ def sofa(at: Place, rng: np.random.Generator, width: float = 1.7) -> None:
 
 
 def meeting_table(at: Place, rng: np.random.Generator, length: float = 2.4) -> None:
-    """A long table along x with chairs on both sides and paper on it, its middle at the place."""
+    """A long table along x with chairs on both sides and paper on it, its middle at the place.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+        length: meters.
+    """
     at.box("top", (-length / 2, -0.5, 0.7), (length, 1.0, 0.05), tex.wood((136, 90, 56)))
     at.legs("leg", (-length / 2 + 0.05, -0.45, 0), (length - 0.1, 0.9, 0.7), tex.wood(DARK), thick=0.08)
     for k in range(4):
@@ -211,7 +295,12 @@ def meeting_table(at: Place, rng: np.random.Generator, length: float = 2.4) -> N
 
 
 def copier(at: Place, rng: np.random.Generator) -> None:
-    """A copying machine at the wall."""
+    """A copying machine at the wall.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+    """
     gray = tex.plaster(tex.shaded(rng, (204, 204, 198), 0.05), 0.05)
     at.box(
         "body",
@@ -226,7 +315,13 @@ def copier(at: Place, rng: np.random.Generator) -> None:
 
 
 def lockers(at: Place, rng: np.random.Generator, count: int = 4) -> None:
-    """A row of lockers at the wall."""
+    """A row of lockers at the wall.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+        count: how many, each 0.4 m wide.
+    """
     width = 0.4 * count
     tone = tex.shaded(rng, (96, 122, 140), 0.15)
     at.box("body", (-width / 2, -0.45, 0), (width, 0.45, 1.85), STEEL, front=tex.front(tone, count, 2))
@@ -234,7 +329,13 @@ def lockers(at: Place, rng: np.random.Generator, count: int = 4) -> None:
 
 
 def bench(at: Place, rng: np.random.Generator, length: float = 1.6) -> None:
-    """A bench at the wall, with a bag on it."""
+    """A bench at the wall, with a bag on it.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+        length: meters.
+    """
     wood = tex.wood(tex.shaded(rng, OAK, 0.1))
     for k in range(3):
         at.box(f"board{k}", (-length / 2, -0.5 + 0.15 * k, 0.42), (length, 0.12, 0.04), wood)
@@ -244,7 +345,12 @@ def bench(at: Place, rng: np.random.Generator, length: float = 1.6) -> None:
 
 
 def cooler(at: Place, rng: np.random.Generator) -> None:
-    """A water cooler at the wall."""
+    """A water cooler at the wall.
+
+    Args:
+        at: where it stands.
+        rng: source of colors and details.
+    """
     at.box("body", (-0.17, -0.36, 0), (0.34, 0.34, 1.0), tex.plaster((216, 216, 210), 0.05))
     at.cylinder(
         "water", (0, -0.19, 1.0), tex.marbled((96, 150, 190), (150, 196, 220), 0.15), radius=0.14, height=0.38
@@ -260,7 +366,15 @@ def decorated(
     *,
     free: tuple[float, float] = (0.0, 0.0),
 ) -> tex.Material:
-    """A wall with a skirting board and pictures at eye height; none of them between the two `free` ends (m)."""
+    """A wall with a skirting board and pictures at eye height.
+
+    Args:
+        base: material of the wall.
+        width: of the wall, meters.
+        height: of the wall, meters.
+        rng: source of the choice, size and place of the pictures.
+        free: both ends of an interval along the wall, meters from its left side, that stays without pictures.
+    """
     patches: list[tuple[Any, float, float, float, float]] = [(tex.skirting, 0.0, height - 0.08, width, 0.08)]
     x = float(rng.uniform(0.2, 0.6))
     while x < width - 0.8:

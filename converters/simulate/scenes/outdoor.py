@@ -20,7 +20,11 @@ HOUSE = (23.0, 11.5, 34.0, 22.5)
 
 
 def outdoor(seed: int) -> Scene:
-    """A block of 44 m x 34 m between facades 5 to 9 m high."""
+    """A block of 44 m x 34 m between facades 5 to 9 m high.
+
+    Args:
+        seed: of layout and textures.
+    """
     scene = Scene("outdoor", seed, np.array(SIZE_M), even_light=EVEN_LIGHT, sun=np.array(SUN))
     rng = random_streams.generator(seed, "simulate.layout", scene="outdoor")
     w, d, _ = SIZE_M
@@ -173,7 +177,14 @@ def _car(at: Place, rng: np.random.Generator) -> None:
 
 
 def asphalt(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
-    """Dark, with patches, cracks and stains."""
+    """Dark, with patches, cracks and stains.
+
+    Args:
+        rng: source of the random choices.
+        width_m: width of the surface, meters.
+        height_m: height of the surface, meters.
+        texel_m: width of a texel, meters.
+    """
     h, w = tex.shape_of(width_m, height_m, texel_m)
     image = tex.flat((h, w), (104, 104, 106))
     image *= (1 + 0.10 * tex.cloud(rng, (h, w), 0.5 / texel_m, 5, gain=0.8))[..., None]
@@ -196,7 +207,14 @@ def asphalt(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
 
 
 def lawn(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
-    """Grass of uneven green with flowers, in a border of stone."""
+    """Grass of uneven green with flowers, in a border of stone.
+
+    Args:
+        rng: source of the random choices.
+        width_m: width of the surface, meters.
+        height_m: height of the surface, meters.
+        texel_m: width of a texel, meters.
+    """
     h, w = tex.shape_of(width_m, height_m, texel_m)
     image = tex.flat((h, w), (84, 116, 58))
     image *= (1 + 0.22 * tex.cloud(rng, (h, w), 0.25 / texel_m, 4, gain=0.9))[..., None]
@@ -208,7 +226,14 @@ def lawn(rng: np.random.Generator, width_m: float, height_m: float, texel_m: flo
 
 
 def stripes(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
-    """A crossing: white bars on asphalt, along the shorter side."""
+    """A crossing: white bars on asphalt, along the shorter side.
+
+    Args:
+        rng: source of the random choices.
+        width_m: width of the surface, meters.
+        height_m: height of the surface, meters.
+        texel_m: width of a texel, meters.
+    """
     image = asphalt(rng, width_m, height_m, texel_m)
     wear = 1 + 0.08 * tex.cloud(rng, image.shape[:2], 0.3 / texel_m, 3, gain=0.8)
     step = 1.0 / texel_m
@@ -220,7 +245,11 @@ def stripes(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
 
 
 def facade(color: tex.Color) -> tex.Material:
-    """The front of a house: rows of windows of its own kind, a door, a shop sign, stains."""
+    """The front of a house: rows of windows of its own kind, a door, a shop sign, stains.
+
+    Args:
+        color: RGB, 0 to 255, of the wall.
+    """
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
         wall = tex.bricks(color) if rng.random() < 0.35 else tex.plaster(tex.shaded(rng, color, 0.1), 0.09)
@@ -251,7 +280,14 @@ def facade(color: tex.Color) -> tex.Material:
 
 
 def pane(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
-    """A window from outside: dark glass, curtains, bars."""
+    """A window from outside: dark glass, curtains, bars.
+
+    Args:
+        rng: source of the random choices.
+        width_m: width of the surface, meters.
+        height_m: height of the surface, meters.
+        texel_m: width of a texel, meters.
+    """
     h, w = tex.shape_of(width_m, height_m, texel_m)
     image = tex.flat((h, w), tex.shaded(rng, (58, 70, 84), 0.3))
     image *= (1 + 0.2 * tex.cloud(rng, (h, w), 0.4 / texel_m, 3, gain=0.7))[..., None]

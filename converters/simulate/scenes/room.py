@@ -11,7 +11,11 @@ from duagc.pipeline.base import random_streams
 
 
 def room(seed: int) -> Scene:
-    """A living room, 6.4 m x 5.6 m x 2.7 m: shelf, sideboard, desk, sofa, low table, dresser, plants, boxes."""
+    """A living room, 6.4 m x 5.6 m x 2.7 m: shelf, sideboard, desk, sofa, low table, dresser, plants, boxes.
+
+    Args:
+        seed: of layout and textures.
+    """
     scene = Scene("room", seed, np.array([6.4, 5.6, 2.7]))
     rng = random_streams.generator(seed, "simulate.layout", scene="room")
     _shell(scene)

@@ -35,7 +35,12 @@ class Flat:
         return np.cross(self.axis_t, self.axis_s)
 
     def points(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
-        """World points [..., 3] and normals [..., 3] at surface coordinates."""
+        """World points [..., 3] and normals [..., 3] at surface coordinates.
+
+        Args:
+            s: meters to the right, [...].
+            t: meters downwards, [...]; broadcasts with s.
+        """
         s, t = np.broadcast_arrays(np.asarray(s, dtype=np.float64), np.asarray(t, dtype=np.float64))
         points = self.corner + s[..., None] * self.axis_s + t[..., None] * self.axis_t
         return points, np.broadcast_to(self.normal, points.shape)
@@ -57,7 +62,12 @@ class Side:
         return 2 * np.pi * self.radius, self.height
 
     def points(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
-        """World points [..., 3] and normals [..., 3] at surface coordinates."""
+        """World points [..., 3] and normals [..., 3] at surface coordinates.
+
+        Args:
+            s: meters around, [...].
+            t: meters down from the top, [...]; broadcasts with s.
+        """
         s, t = np.broadcast_arrays(np.asarray(s, dtype=np.float64), np.asarray(t, dtype=np.float64))
         angle = s / self.radius
         normals = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
@@ -80,7 +90,12 @@ class Ball:
         return 2 * np.pi * self.radius, np.pi * self.radius
 
     def points(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
-        """World points [..., 3] and normals [..., 3] at surface coordinates."""
+        """World points [..., 3] and normals [..., 3] at surface coordinates.
+
+        Args:
+            s: longitude times radius, meters, [...].
+            t: angle from the top times radius, meters, [...]; broadcasts with s.
+        """
         lon = np.asarray(s, dtype=np.float64) / self.radius
         polar = np.asarray(t, dtype=np.float64) / self.radius
         normals = np.stack([np.sin(polar) * np.cos(lon), np.sin(polar) * np.sin(lon), np.cos(polar)], axis=-1)
@@ -100,16 +115,28 @@ class Box:
     shades: bool = True
 
     def local(self, points: ArrayLike) -> Array:
-        """World points [..., 3] in the frame of the box."""
+        """World points in the frame of the box, [..., 3].
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
         return self.turned(np.asarray(points, dtype=np.float64) - self.center)
 
     def turned(self, vectors: ArrayLike) -> Array:
-        """World vectors [..., 3] in the frame of the box."""
+        """World vectors in the frame of the box, [..., 3].
+
+        Args:
+            vectors: [..., 3], world frame.
+        """
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.asarray(vectors) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def distance(self, points: ArrayLike) -> Array:
-        """Signed distance (m) of world points [..., 3] to the box, negative inside."""
+        """Signed distance (m) of points to the box, negative inside, [...].
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
         q = np.abs(self.local(points)) - self.half
         return np.linalg.norm(np.maximum(q, 0.0), axis=-1) + np.minimum(q.max(axis=-1), 0.0)
 
@@ -124,7 +151,11 @@ class Cylinder:
     shades: bool = True
 
     def distance(self, points: ArrayLike) -> Array:
-        """Signed distance (m) of world points [..., 3] to the cylinder, negative inside."""
+        """Signed distance (m) of points to the cylinder, negative inside, [...].
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
         p = np.asarray(points, dtype=np.float64) - self.base
         radial = np.hypot(p[..., 0], p[..., 1]) - self.radius
         along = np.abs(p[..., 2] - self.height / 2) - self.height / 2
@@ -141,7 +172,11 @@ class Sphere:
     shades: bool = True
 
     def distance(self, points: ArrayLike) -> Array:
-        """Signed distance (m) of world points [..., 3] to the sphere, negative inside."""
+        """Signed distance (m) of points to the sphere, negative inside, [...].
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
         return np.linalg.norm(np.asarray(points, dtype=np.float64) - self.center, axis=-1) - self.radius
 
 
@@ -178,7 +213,11 @@ class Scene:
     sun: Array | None = None
 
     def clearance(self, points: ArrayLike) -> Array:
-        """Distance (m) of world points [..., 3] to the nearest surface; negative outside the room or in a solid."""
+        """Distance (m) of points to the nearest surface, [...]; negative outside the room or in a solid.
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
         p = np.asarray(points, dtype=np.float64)
         nearest = np.minimum(p, self.size - p).min(axis=-1)
         for solid in self.solids:
@@ -197,10 +236,19 @@ class Scene:
         shades: bool = True,
         **faces: tex.Material,
     ) -> None:
-        """Put a box with its low corner at `low`; `faces` (front, back, left, right, top, under) override the material.
+        """Put a box.
 
-        Front looks south (-y). `yaw_rad` turns the box about the vertical through `about` (default: its own center).
-        Faces that lie on a wall or on the floor are left out.
+        Front looks south (-y). Faces that lie on a wall or on the floor are left out.
+
+        Args:
+            name: of the box; its surfaces are called name/face.
+            low: its low corner before the turn [3], meters, world frame.
+            size: [3], meters.
+            material: of the faces that `faces` does not name.
+            yaw_rad: turn about the vertical through `about`.
+            about: (x, y) or a point of the axis of the turn, meters, world frame; None: the box's own center.
+            shades: whether it casts shadows.
+            faces: materials by face: front, back, left, right, top, under.
         """
         low, size = np.asarray(low, dtype=np.float64), np.asarray(size, dtype=np.float64)
         center = low + size / 2
@@ -229,7 +277,15 @@ class Scene:
     def cylinder(
         self, name: str, base: ArrayLike, material: tex.Material, *, radius: float, height: float
     ) -> None:
-        """Put an upright cylinder with its lid on `base`."""
+        """Put an upright cylinder with its lid.
+
+        Args:
+            name: of the cylinder.
+            base: middle of its foot [3], meters, world frame.
+            material: of side and lid.
+            radius: meters.
+            height: meters.
+        """
         base = np.asarray(base, dtype=np.float64)
         self.solids.append(Cylinder(base, radius, height))
         self.surfaces.append(Side(f"{name}/side", material, base, radius, height))
@@ -238,7 +294,14 @@ class Scene:
         self.surfaces.append(Flat(f"{name}/lid", material, lid, x, -y, (2 * radius, 2 * radius), round=True))
 
     def sphere(self, name: str, center: ArrayLike, radius: float, material: tex.Material) -> None:
-        """Put a sphere."""
+        """Put a sphere.
+
+        Args:
+            name: of the sphere.
+            center: [3], meters, world frame.
+            radius: meters.
+            material: of its surface.
+        """
         center = np.asarray(center, dtype=np.float64)
         self.solids.append(Sphere(center, radius))
         self.surfaces.append(Ball(name, material, center, radius))
@@ -246,7 +309,16 @@ class Scene:
     def legs(
         self, name: str, low: ArrayLike, size: ArrayLike, material: tex.Material, *, thick: float, **turn: Any
     ) -> None:
-        """Put four legs under the box [low, low + size]."""
+        """Put four legs under a box; they cast no shadows.
+
+        Args:
+            name: of the piece of furniture.
+            low: low corner of the box [3], meters, world frame.
+            size: of the box [3], meters; the legs are as high as it.
+            material: of the legs.
+            thick: width of a leg, meters.
+            turn: `yaw_rad` and `about` of `box`.
+        """
         low, size = np.asarray(low, dtype=np.float64), np.asarray(size, dtype=np.float64)
         for i, (dx, dy) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
             corner = low + np.array([dx, dy, 0]) * (size - thick)

@@ -40,7 +40,16 @@ def cloud(
     gain: float = 0.6,
     stretch: float = 1.0,
 ) -> Image:
-    """Sum of smooth noises, each with half the wave length and `gain` times the height of the one before."""
+    """Sum of smooth noises, each with half the wave length and `gain` times the height of the one before.
+
+    Args:
+        rng: source of the nodes.
+        shape: (rows, columns) of texels.
+        wave: texels between the random nodes of the first noise.
+        octaves: how many noises.
+        gain: height of a noise as a share of that of the one before.
+        stretch: factor of the wave length along the rows (x).
+    """
     field = np.zeros(shape, dtype=np.float32)
     height = norm = 1.0
     for _ in range(octaves):

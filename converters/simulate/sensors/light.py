@@ -17,7 +17,11 @@ DRIFT_PERIODS_S = (2.5, 7.0)
 
 
 def metered(color: NDArray[np.uint8]) -> float:
-    """Mean light of an image [h, w, 3], 0 to 1, as an exposure meter sees it that weighs all pixels alike."""
+    """Mean light of an image, 0 to 1, as an exposure meter sees it that weighs all pixels alike.
+
+    Args:
+        color: [h, w, 3], RGB.
+    """
     return float(((color / 255.0) ** GAMMA @ GRAY_OF_RGB).mean())
 
 

@@ -28,17 +28,31 @@ GRAY_SIGMA = 0.01  # of full scale
 
 
 def axial_sigma_m(depth_m: Array) -> Array:
-    """Standard deviation (m) of the measured depth at depths (m) of any shape."""
+    """Standard deviation (m) of the measured depth at depths (m) of any shape.
+
+    Args:
+        depth_m: [...], meters.
+    """
     return 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
 
 
 def depth_step_m(depth_m: Array) -> Array:
-    """Distance (m) between neighboring measurable depths around depths (m) of any shape."""
+    """Distance (m) between neighboring measurable depths around depths (m) of any shape.
+
+    Args:
+        depth_m: [...], meters.
+    """
     return DISPARITY_STEP_PX * depth_m**2 / (SENSOR_FOCAL_PX * BASELINE_M)
 
 
 def kinect_depth(depth: Array, camera: PinholeCamera, rng: np.random.Generator) -> Array:
-    """Measured depth [h, w] (m, 0 = none) of an exact depth image [h, w] (m, 0 = nothing there)."""
+    """Measured depth [h, w] (m, 0 = none) of an exact depth image.
+
+    Args:
+        depth: exact, [h, w], meters, 0 = nothing there.
+        camera: of the image.
+        rng: source of the errors.
+    """
     smooth, spots, dice = (
         rng.standard_normal(depth.shape),
         rng.standard_normal(depth.shape),
@@ -79,7 +93,12 @@ def quantized(depth: Array, step_m: float) -> Array:
 
 
 def gray_noise(color: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A color image [h, w, 3] with independent noise of its brightness."""
+    """A color image with independent noise of its brightness.
+
+    Args:
+        color: [h, w, 3].
+        rng: source of the noise.
+    """
     noise = 255 * GRAY_SIGMA * rng.standard_normal(color.shape[:2])
     return np.clip(np.rint(color + noise[..., None]), 0, 255).astype(np.uint8)
 

@@ -60,19 +60,35 @@ class Rig:
         return self.sensor == "rgbd" and self.readout_s == self.exposure_s == 0.0
 
     def clock_offset_ns(self, seed: int, robot: str) -> int:
-        """What a robot's clock shows at the time 0."""
+        """What a robot's clock shows at the time 0, ns.
+
+        Args:
+            seed: of the simulation.
+            robot: its name.
+        """
         return round(
             1e9 * self.clock_s * random_streams.generator(seed, "simulate.clock", robot=robot).uniform(-1, 1)
         )
 
     def gain(self, seed: int, robot: str, time_s: float) -> float:
-        """Exposure of a frame, as a factor of the light."""
+        """Exposure of a frame, as a factor of the light.
+
+        Args:
+            seed: of the simulation.
+            robot: its name.
+            time_s: of the frame, seconds since the first one.
+        """
         rng = random_streams.generator(seed, "simulate.gain", robot=robot)
         periods, phases = rng.uniform(*GAIN_PERIODS_S, 2), rng.uniform(0, 2 * np.pi, 2)
         return float(2 ** (self.gain_stops * np.sin(2 * np.pi * time_s / periods + phases).mean()))
 
     def tint(self, seed: int, robot: str) -> tuple[Array, Array]:
-        """How a robot's camera sees colors: gain [3] (of image values) and black level [3] (0..1) by channel."""
+        """How a robot's camera sees colors: gain [3] (of image values) and black level [3] (0..1) by channel.
+
+        Args:
+            seed: of the simulation.
+            robot: its name.
+        """
         if self.camera_stops == 0:
             return np.ones(3), np.zeros(3)
         rng = random_streams.generator(seed, "simulate.tint", robot=robot)
@@ -83,7 +99,13 @@ class Rig:
 def with_gain(
     color: NDArray[np.uint8], gain: float, tint: tuple[Array, Array] = (np.ones(3), np.zeros(3))
 ) -> NDArray[np.uint8]:
-    """An image [h, w, 3] with another exposure, seen by a camera of this tint; what is too bright is white."""
+    """An image with another exposure, seen by a camera of its own tint; what is too bright is white.
+
+    Args:
+        color: [h, w, 3].
+        gain: exposure, as a factor of the light.
+        tint: gain [3] of image values and black level [3] (0..1) by channel, as from `Rig.tint`.
+    """
     scale, black = tint
     return np.clip(np.rint(color * (gain ** (1 / GAMMA) * scale) + 255 * black), 0, 255).astype(np.uint8)
 
@@ -183,7 +205,13 @@ class MovingCamera:
         return t, colors, moving
 
     def sweep(self, T_world_camera: Array, frame: int, rng: np.random.Generator) -> Array:
-        """Points [n, 3] (m, LiDAR) of one turn of the LiDAR at one moment, with the noise of its ranges."""
+        """Points [n, 3] (m, LiDAR) of one turn of the LiDAR at one moment, with the noise of its ranges.
+
+        Args:
+            T_world_camera: camera pose at that moment, [4, 4].
+            frame: index, for the movers.
+            rng: source of the noise of the ranges.
+        """
         up, turn = np.deg2rad(RINGS_DEG)[:, None], np.linspace(-np.pi, np.pi, AZIMUTHS, endpoint=False)
         beams = np.stack(
             np.broadcast_arrays(np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)), axis=-1

@@ -55,7 +55,13 @@ Shape = Callable[[Figure, int, Sequence[float]], tuple[Array, float]]
 
 
 def circle(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Array, float]:
-    """An arc of one of the concentric circles, turned by the spread against the one before."""
+    """An arc of one of the concentric circles, turned by the spread against the one before.
+
+    Args:
+        figure: middle, direction and size.
+        robots: how many in the team.
+        spreads: 0 to 1, of the robots up to this one.
+    """
     radius = figure.reach_m * (0.5 + 0.5 * (len(spreads) - 1) / (robots - 1) if robots > 1 else 1.0)
     length = min(figure.length_m, CIRCLE_TURN_RAD * radius * (figure.frames - 1))
     half = (length / 2 + RESERVE_M) / radius
@@ -69,6 +75,11 @@ def crossing(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Arr
 
     Many robots go at the same time, in evenly spread directions, and leave the middle to their left, as at a
     roundabout; the spread says how many directions on from the robot before.
+
+    Args:
+        figure: middle, direction and size.
+        robots: how many in the team.
+        spreads: 0 to 1, of the robots up to this one.
     """
     k = len(spreads) - 1
     if robots > CROSSING_ONE_POINT:
@@ -82,7 +93,15 @@ def crossing(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Arr
 
 
 def parallel(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Array, float]:
-    """A straight path next to the one before, with the spread farther from it, and behind and ahead of it by turns."""
+    """A straight path next to the one before.
+
+    The spread puts it farther from that one, and behind and ahead of it by turns.
+
+    Args:
+        figure: middle, direction and size.
+        robots: how many in the team.
+        spreads: 0 to 1, of the robots up to this one.
+    """
     k, widest = len(spreads) - 1, max(LINES_APART_M, 2 * figure.reach_m / max(robots - 1, 1))
     aside = k * LINES_APART_M + sum(spreads) * (widest - LINES_APART_M) - figure.reach_m
     ahead = 0.8 * figure.length_m * sum((-1) ** i * spread for i, spread in enumerate(spreads))
@@ -90,7 +109,13 @@ def parallel(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Arr
 
 
 def follower(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Array, float]:
-    """A part of the route, with the spread farther behind the one before."""
+    """A part of the route, with the spread farther behind the one before.
+
+    Args:
+        figure: middle, direction and size.
+        robots: how many in the team.
+        spreads: 0 to 1, of the robots up to this one.
+    """
     assert figure.route is not None
     farthest = longest_lag(figure.length_m, robots)
     lag = (len(spreads) - 1) * APART_M * 1.1 + sum(spreads) * (farthest - APART_M * 1.1)
@@ -108,7 +133,12 @@ SHAPES: dict[str, Shape] = {
 
 
 def longest_lag(length_m: float, robots: int) -> float:
-    """How far (m) a follower may be behind the one before."""
+    """How far (m) a follower may be behind the one before.
+
+    Args:
+        length_m: of a path.
+        robots: how many in the team.
+    """
     each, whole = FARTHEST_BEHIND_M
     return max(1.5 * APART_M, min(length_m, each, whole / max(robots - 1, 1)))
 
@@ -131,7 +161,11 @@ class GroundPath:
     heading_rad: Array
 
     def poses(self, gaze_rad: float) -> Array:
-        """T_world_camera [frames, 4, 4], looking to the side of the path by `gaze_rad`, a little down."""
+        """T_world_camera [frames, 4, 4], looking to the side of the path, a little down.
+
+        Args:
+            gaze_rad: yaw of the camera from the direction of motion, counter-clockwise.
+        """
         yaw = self.heading_rad + gaze_rad
         gaze = np.stack([np.cos(yaw), np.sin(yaw), np.full(len(yaw), np.tan(PITCH_RAD))], axis=1)
         return look_at(self.position, self.position + gaze)
@@ -160,7 +194,14 @@ class Ground:
         self._fields = np.stack([margin, *slope], axis=-1)
 
     def figure(self, paradigm: str, robots: int, size: float, attempt: int) -> Figure:
-        """A figure drawn at random, its paths `size` times as long as frames and steps would make them."""
+        """A figure drawn at random.
+
+        Args:
+            paradigm: a key of `SHAPES`.
+            robots: how many.
+            size: factor of the length of its paths, which at 1 is that of the frames' steps.
+            attempt: number of the try; each has random numbers of its own.
+        """
         space, length = self.space, size * (self.frames - 1) * self.terrain.step_m
         rng = random_streams.generator(
             self.seed, "simulate.figure", paradigm=paradigm, size=str(size), attempt=attempt
@@ -183,7 +224,14 @@ class Ground:
     def ground_path(
         self, shape: Shape, figure: Figure, robots: int, spreads: Sequence[float]
     ) -> GroundPath | None:
-        """The path of the robot that has the last of the spreads; None if it is not free."""
+        """The path of the robot that has the last of the spreads; None if it is not free.
+
+        Args:
+            shape: of the figure.
+            figure: middle, direction and size.
+            robots: how many in the team.
+            spreads: 0 to 1, of the robots up to this one.
+        """
         self.planned += 1
         curve, length = shape(figure, robots, spreads)
         if len(curve) < 8 or self.margin(curve).min() < -GIVE_WAY_M:
@@ -202,11 +250,19 @@ class Ground:
         return np.asarray((1 - u) * low + u * high)
 
     def margin(self, points: Array) -> Array:
-        """How far (m) points [n, 2] are inside the free floor; negative outside."""
+        """How far (m) points are inside the free floor, [n]; negative outside.
+
+        Args:
+            points: [n, 2], x and y, meters, world frame.
+        """
         return self._at(points)[:, 0]
 
     def bent(self, curve: Array) -> Array | None:
-        """A curve [n, 2] moved aside until it is free, or None."""
+        """A curve moved aside until it is free, or None.
+
+        Args:
+            curve: [n, 2], x and y, meters, world frame.
+        """
         from scipy.ndimage import gaussian_filter1d
 
         moved = np.zeros_like(curve)
@@ -260,5 +316,10 @@ def _length(curve: Array) -> float:
 
 
 def apart(one: GroundPath, other: GroundPath) -> float:
-    """Least distance (m) on the floor between two robots at the same time."""
+    """Least distance (m) on the floor between two robots at the same time.
+
+    Args:
+        one: path of a robot.
+        other: path of another one, with as many frames.
+    """
     return float(np.linalg.norm(one.position[:, :2] - other.position[:, :2], axis=1).min())

@@ -50,7 +50,11 @@ class Loop:
     gaze_m: Array
 
     def positions(self, angle: Array) -> Array:
-        """Positions [n, 3] at angles [n]."""
+        """Positions [n, 3], meters, world frame.
+
+        Args:
+            angle: along the loop, rad, [n].
+        """
         stretch = 1 + self.waver[0] * np.sin(2 * angle + self.phases[0])
         x = self.middle[0] + self.radii[0] * stretch * np.cos(angle)
         y = self.middle[1] + self.radii[1] * stretch * np.sin(angle)
@@ -58,7 +62,11 @@ class Loop:
         return np.stack([x, y, z], axis=1)
 
     def targets(self, angle: Array) -> Array:
-        """Points [n, 3] that the camera looks at from angles [n]."""
+        """Points [n, 3] that the camera looks at, meters, world frame.
+
+        Args:
+            angle: of its position along the loop, rad, [n].
+        """
         across = angle + np.pi + self.waver[2] * np.sin(2 * angle + self.phases[2])
         x = self.middle[0] + self.gaze_m[0] * np.cos(across)
         y = self.middle[1] + self.gaze_m[1] * np.sin(across)
@@ -66,7 +74,12 @@ class Loop:
         return np.stack([x, y, z], axis=1)
 
     def poses(self, frames: int, middle_angle: float) -> Array:
-        """T_world_camera [frames, 4, 4], STEP_M apart along the loop, the middle frame at `middle_angle`."""
+        """T_world_camera [frames, 4, 4], STEP_M apart along the loop.
+
+        Args:
+            frames: how many.
+            middle_angle: of the middle frame, rad.
+        """
         from scipy.interpolate import CubicSpline
 
         half = (frames - 1) / 2 * STEP_M
@@ -81,7 +94,12 @@ class Loop:
 
 
 def look_at(positions: Array, targets: Array) -> Array:
-    """T_world_camera [n, 4, 4] of cameras at positions [n, 3] that look at targets [n, 3], upright."""
+    """T_world_camera [n, 4, 4] of upright cameras.
+
+    Args:
+        positions: of the cameras, [n, 3], meters, world frame.
+        targets: points that they look at, [n, 3], meters, world frame.
+    """
     forward = targets - positions
     forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, UP)
@@ -158,7 +176,12 @@ class PathViews:
 
 
 def look(renderer: CameraRenderer, path: Array) -> PathViews:
-    """Some views, evenly spread, along a path T_world_camera [frames, 4, 4]."""
+    """Some views, evenly spread, along a path.
+
+    Args:
+        renderer: of the views.
+        path: T_world_camera [frames, 4, 4].
+    """
     poses = path[np.unique(np.linspace(0, len(path) - 1, OVERLAP_VIEWS).round().astype(np.int64))]
     depths = np.stack([renderer.depth(T)[0] for T in poses])
     rays = renderer.camera.rays()
@@ -169,7 +192,13 @@ def look(renderer: CameraRenderer, path: Array) -> PathViews:
 
 
 def shared(camera: PinholeCamera, a: PathViews, b: PathViews) -> float:
-    """Share of the pixels of views a whose points views b see too, and vice versa, averaged."""
+    """Share of the pixels of views a whose points views b see too, and vice versa, averaged.
+
+    Args:
+        camera: of the views.
+        a: views along a path.
+        b: views along another one.
+    """
     shares = []
     for one, other in ((a, b), (b, a)):
         seen = np.zeros(len(one.points), dtype=bool)
@@ -180,12 +209,24 @@ def shared(camera: PinholeCamera, a: PathViews, b: PathViews) -> float:
 
 
 def shared_view(renderer: CameraRenderer, path_a: Array, path_b: Array) -> float:
-    """Share of the pixels along path a [n, 4, 4] whose points path b sees too, and vice versa, averaged."""
+    """Share of the pixels along path a whose points path b sees too, and vice versa, averaged.
+
+    Args:
+        renderer: of the views.
+        path_a: T_world_camera [n, 4, 4].
+        path_b: T_world_camera [m, 4, 4].
+    """
     return shared(renderer.camera, look(renderer, path_a), look(renderer, path_b))
 
 
 def sees(camera: PinholeCamera, depth: Array, points_camera: Array) -> NDArray[np.bool_]:
-    """Whether a view with this depth [h, w] sees points [n, 3] of its camera frame, nothing in front of them."""
+    """Whether a view sees points, nothing in front of them, [n].
+
+    Args:
+        camera: of the view.
+        depth: of the view, [h, w], meters, 0 = nothing.
+        points_camera: [n, 3], meters, camera frame.
+    """
     index, u, v = visible(camera, points_camera, near_m=0.1)
     z, seen = points_camera[index, 2], np.zeros(len(points_camera), dtype=bool)
     seen[index] = np.abs(depth[v, u] - z) < OVERLAP_TOLERANCE * z

@@ -270,7 +270,11 @@ def _error(team: list[_Member], robots: int) -> float:
 
 
 def least_apart(paths: list[Array]) -> float:
-    """Least distance (m) on the floor between two robots at the same time; of one robot, infinity."""
+    """Least distance (m) on the floor between two robots at the same time; of one robot, infinity.
+
+    Args:
+        paths: T_world_camera [frames, 4, 4] of every robot.
+    """
     at = np.stack([path[:, :2, 3] for path in paths])
     gaps = [np.linalg.norm(at[i] - at[j], axis=1).min() for i in range(len(at)) for j in range(i)]
     return float(min(gaps, default=np.inf))

@@ -57,7 +57,11 @@ def route(
 
 
 def length_of(route: Array) -> float:
-    """Length (m) of a path of `route`."""
+    """Length (m) of a path.
+
+    Args:
+        route: [n, 2], as from `route`, ROUTE_STEP_M apart.
+    """
     return ROUTE_STEP_M * (len(route) - 1)
 
 

@@ -87,13 +87,25 @@ class Terrain(Protocol):
     sky: bool  # there is no ceiling
 
     def renderer(self, camera: PinholeCamera) -> CameraRenderer:
-        """A renderer."""
+        """A renderer.
+
+        Args:
+            camera: of the views.
+        """
 
     def sketch_renderer(self, camera: PinholeCamera) -> CameraRenderer:
-        """A renderer for depth alone, the quickest there is."""
+        """A renderer for depth alone, the quickest there is.
+
+        Args:
+            camera: of the views.
+        """
 
     def clearance(self, points: Array) -> Array:
-        """Distance (m) of world points [..., 3] to the nearest surface."""
+        """Distance (m) of points to the nearest surface, [...].
+
+        Args:
+            points: [..., 3], meters, world frame.
+        """
 
     def free_space(self) -> WalkableSpace:
         """Where a robot can stand."""
@@ -130,7 +142,14 @@ def plan(
 
 
 def floor_height(caster: Caster) -> float:
-    """Height (m) of the floor: the lowest of the levels that hold much horizontal surface."""
+    """Height (m) of the floor: the lowest of the levels that hold much horizontal surface.
+
+    Args:
+        caster: of the scene.
+
+    Raises:
+        DuagError: the scene has no horizontal surface.
+    """
     a, b, c = np.moveaxis(caster.scene.corners, 1, 0)
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
@@ -147,7 +166,11 @@ def floor_height(caster: Caster) -> float:
 
 
 def free_space(caster: Caster, sky: bool = False) -> WalkableSpace:
-    """The largest connected free space of a scene; under a sky only the floor below matters.
+    """The largest connected free space of a scene.
+
+    Args:
+        caster: of the scene.
+        sky: whether there is a sky above; then only the floor below matters.
 
     Raises:
         DuagError: it is smaller than LEAST_FREE_M2.
@@ -319,7 +342,13 @@ def _look_ahead(
 
 
 def sees_enough(renderer: CameraRenderer, poses: Array, sky: bool) -> bool:
-    """Whether no view of a walk shows holes or a near wall."""
+    """Whether no view of a walk shows holes or a near wall.
+
+    Args:
+        renderer: of the views.
+        poses: of the walk, T_world_camera [frames, 4, 4].
+        sky: whether there is a sky, which fills more of a view than holes may.
+    """
     for T in _some_views(poses):
         depth, _ = renderer.depth(T)
         seen = depth > 0
