@@ -143,7 +143,14 @@ def information(log: Path, folder: Path, config: RunConfig, *, threads: Supports
 
 
 def agent_input(robot: str, log: Path, folder: Path, config: RunConfig) -> AgentInput:
-    """What the agent of a robot may know before the first packet: its own log and its own results."""
+    """What the agent of a robot may know before the first packet: its own log and its own results.
+
+    Args:
+        robot: name, or that of a component.
+        log: of its sensors.
+        folder: of its own results.
+        config: of the run.
+    """
     from duagc.pipeline.runs.robot_data import AgentInput
 
     files = folder / "frontend.mcap", folder / "information.mcap"
@@ -260,8 +267,21 @@ def fuse_robot(
 ) -> dict[str, str]:
     """Fused map and corrected trajectory of one robot, into the folder of its own results.
 
+    Args:
+        robot: its name.
+        log: of its sensors.
+        folder: of its own results; gets the fused map and the corrected trajectory.
+        result: of the session, as this robot has it.
+        config: of the run.
+        threads: of the rasterizer; changes no bit of the result.
+        checkpoints: from which it goes on, and to which it saves; None: none. They change no bit of the
+            result.
+
     Returns:
         Neighbors of whose maps nothing is used, and why.
+
+    Raises:
+        DuagError: a file lacks what it should hold, or two files do not belong together.
     """
     from duagc.pipeline.fusion.stage import run_fusion
 

@@ -18,8 +18,17 @@ RECORDING = "a recording", ("recording.json",)
 def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) -> Iterator[Path]:
     """A folder next to `out` that takes its name when the block ends well, and is removed when it does not.
 
-    force: replace what is there, if it is empty or of this kind: its name, and the files that mark it. A symbolic link
-        stays, and the folder that it names is replaced.
+    Args:
+        out: name of the finished folder.
+        force: replace what is there, if it is empty or of this kind. A symbolic link stays, and the folder
+            that it names is replaced.
+        kind: name of the kind for messages, and the files of which one marks such a folder.
+
+    Yields:
+        The folder to write to, empty.
+
+    Raises:
+        DuagError: `out` cannot be replaced, or another process writes it.
     """
     _check_out(out, force, kind)
     if out.is_symlink():

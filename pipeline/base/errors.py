@@ -18,7 +18,13 @@ class DuagError(Exception):
 
 
 def closest(word: str, known: Sequence[str], kind: str) -> str:
-    """The end of a line about a wrong name: what was perhaps meant, else what there is, else that no `kind` is."""
+    """The end of a line about a wrong name: what was perhaps meant, else what there is, else that no `kind` is.
+
+    Args:
+        word: the wrong name.
+        known: names that exist.
+        kind: what the name is of, with its article.
+    """
     import difflib
 
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)

@@ -20,6 +20,11 @@ LARGEST_BYTES = 1 << 29
 def check_file(path: Path, expected: str, largest: int | None = None) -> int:
     """The size of a regular file in bytes; opening anything else might never end.
 
+    Args:
+        path: of the file.
+        expected: what the file should be, for the line of the error.
+        largest: size in bytes that is still accepted; None: any.
+
     Raises:
         DuagError: it is missing, a folder, a pipe or a device, or larger than `largest` bytes.
     """
@@ -40,7 +45,15 @@ def check_file(path: Path, expected: str, largest: int | None = None) -> int:
 
 
 def read_bytes(path: Path, expected: str) -> bytes:
-    """The bytes of a file. Raises DuagError as `check_file` does."""
+    """The bytes of a file.
+
+    Args:
+        path: of the file.
+        expected: what the file should be, for the line of the error.
+
+    Raises:
+        DuagError: as `check_file`, or it cannot be read.
+    """
     check_file(path, expected, LARGEST_BYTES)
     try:
         return path.read_bytes()
@@ -49,7 +62,15 @@ def read_bytes(path: Path, expected: str) -> bytes:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """The text of a file in UTF-8, without a byte order mark. Raises DuagError as `check_file` does."""
+    """The text of a file in UTF-8, without a byte order mark.
+
+    Args:
+        path: of the file.
+        expected: what the file should be, for the line of the error.
+
+    Raises:
+        DuagError: as `read_bytes`, or it is not UTF-8.
+    """
     try:
         return read_bytes(path, expected).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -57,12 +78,29 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def read_toml(path: Path, expected: str) -> dict[str, Any]:
-    """The content of a TOML file. Raises DuagError as `check_file` does, and if it is not TOML."""
+    """The content of a TOML file.
+
+    Args:
+        path: of the file.
+        expected: what the file should be, for the line of the error.
+
+    Raises:
+        DuagError: as `read_text`, or it is not TOML.
+    """
     return parse_toml(read_text(path, expected), path, expected)
 
 
 def parse_toml(text: str, path: Path, expected: str) -> dict[str, Any]:
-    """The content of a TOML file whose text is there. Raises DuagError if it is not TOML."""
+    """The content of a TOML file whose text is there.
+
+    Args:
+        text: of the file.
+        path: of the file, for the line of the error.
+        expected: what the file should be, for the line of the error.
+
+    Raises:
+        DuagError: it is not TOML.
+    """
     import tomllib
 
     try:
@@ -72,7 +110,15 @@ def parse_toml(text: str, path: Path, expected: str) -> dict[str, Any]:
 
 
 def read_json(path: Path, expected: str) -> dict[str, Any]:
-    """The content of a file of one JSON object. Raises DuagError as `check_file` does, and if it is none."""
+    """The content of a file of one JSON object.
+
+    Args:
+        path: of the file.
+        expected: what the file should be, for the line of the error.
+
+    Raises:
+        DuagError: as `read_text`, or it is no JSON object.
+    """
     try:
         content = json.loads(read_text(path, expected))
     except (ValueError, RecursionError) as error:
@@ -118,6 +164,12 @@ def size_bytes(path: Path) -> int:
 def new_file(path: Path) -> Iterator[Path]:
     """A name next to `path` to write to: it becomes `path` when the block ends well, else it is removed.
 
+    Args:
+        path: of the finished file; replaced if it exists.
+
+    Yields:
+        The name to write to.
+
     Raises:
         DuagError: it cannot be written there.
     """
@@ -153,7 +205,12 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def decode_image(data: bytes, flags: int) -> NDArray[Any] | None:
-    """What OpenCV makes of an encoded image; None if nothing, or more pixels than `determinism` allows."""
+    """What OpenCV makes of an encoded image; None if nothing, or more pixels than `determinism` allows.
+
+    Args:
+        data: bytes of the encoded image.
+        flags: cv2.IMREAD_*.
+    """
     import cv2
     import numpy as np
 

@@ -16,7 +16,11 @@ _of_this_process: list[tuple[c_int, int]] = []
 
 
 def threads_per_worker(workers: int) -> int:
-    """Threads of each of `workers` processes on this machine."""
+    """Threads of each of `workers` processes on this machine.
+
+    Args:
+        workers: number of processes, 1 or more.
+    """
     return max(1, processors() // workers)
 
 

@@ -92,7 +92,11 @@ def _remove(path: Path) -> None:
 
 
 def format_table(found: dict[str, Any]) -> str:
-    """The result of `run` as text."""
+    """The result of `run` as text.
+
+    Args:
+        found: what `run` returned.
+    """
     rows = [
         ("processor time", "cpu_s", 1.0, "s"),
         ("wall time", "wall_s", 1.0, "s"),

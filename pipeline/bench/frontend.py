@@ -93,6 +93,9 @@ class Plan:
 def run(plan: Plan) -> dict[str, Any]:
     """Measure; the result as {"machine", "recording", "rows", "reasons"}, ready for JSON.
 
+    Args:
+        plan: what to measure.
+
     Raises:
         DuagError: the recording is broken, or has no such robot; Open3D cannot be imported.
     """
@@ -153,6 +156,10 @@ def _jobs(plan: Plan, robot: str) -> Iterator[_Job]:
 def changed(config: FrontendConfig, values: Mapping[str, Any]) -> FrontendConfig:
     """A configuration with other values, by dotted names.
 
+    Args:
+        config: left as it is.
+        values: by dotted names below "frontend".
+
     Raises:
         DuagError: there is no such setting.
     """
@@ -199,7 +206,15 @@ def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str
 
 
 def measure(log: Path, folder: Path, config: FrontendConfig, *, seed: int, threads: int) -> dict[str, Any]:
-    """Run the front end on a log into folder/frontend.mcap, in a fresh process; times and peak memory."""
+    """Run the front end on a log into folder/frontend.mcap, in a fresh process; times and peak memory.
+
+    Args:
+        log: of the robot.
+        folder: gets frontend.mcap.
+        config: of the front end.
+        seed: of its random streams.
+        threads: of the kernels.
+    """
     from duagc.pipeline.frontend.stage import run_frontend
 
     whole = {"frame": ("submaps.SubmapTracker", "track"), "poses": ("poses.PathOptimization", "run")}
@@ -363,7 +378,11 @@ def _row(plan: Plan, source: Recording, job: _Job) -> dict[str, Any]:
 
 
 def by_cap(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """What `report.figures.map_sizes` draws: the runs with a map, robot by robot, smallest cap first."""
+    """What `report.figures.map_sizes` draws: the runs with a map, robot by robot, smallest cap first.
+
+    Args:
+        result: of `run`.
+    """
     robots: dict[str, list[dict[str, Any]]] = {}
     for row in sorted(result["rows"], key=lambda row: row.get("max_gaussians", 0)):
         if row["name"] == "map":

@@ -42,7 +42,13 @@ def trajectory_errors_of(
 
 
 def agreement_of(source: Recording, robot: RobotRun, estimated: Trajectory) -> dict[str, Any]:
-    """How well held-out views agree, under the estimate and under the ground truth."""
+    """How well held-out views agree, under the estimate and under the ground truth.
+
+    Args:
+        source: the recording.
+        robot: that was tracked.
+        estimated: T_map_camera of its frames.
+    """
     true = groundtruth.trajectory(source, robot.robot)
     pairs: Paired | Absent = true if isinstance(true, Absent) else trajectory_errors.pair(true, estimated)
     if not isinstance(pairs, Absent):
@@ -55,7 +61,14 @@ def agreement_of(source: Recording, robot: RobotRun, estimated: Trajectory) -> d
 
 
 def map_errors_of(source: Recording, robot: RobotRun, estimated: Trajectory, threads: int) -> dict[str, Any]:
-    """Scores of the map over the held-out views, after and before its final refinement."""
+    """Scores of the map over the held-out views, after and before its final refinement.
+
+    Args:
+        source: the recording.
+        robot: that was mapped.
+        estimated: T_map_camera of its frames.
+        threads: views rendered at the same time; changes no bit of the result.
+    """
     maps = {"refined": robot.own_map, "unrefined": robot.unrefined_map}
     row: dict[str, Any] = {"gaussians": len(robot.own_map.gaussians)}
     for name, found in maps.items():

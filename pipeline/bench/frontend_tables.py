@@ -10,7 +10,11 @@ from duagc.pipeline.evaluation import map_agreement
 
 
 def format_tables(result: dict[str, Any]) -> str:
-    """The rows as Markdown tables: tracking, mapping by cap, parts."""
+    """The rows as Markdown tables: tracking, mapping by cap, parts.
+
+    Args:
+        result: of `frontend.run`.
+    """
     machine, rows = result["machine"], result["rows"]
     about = [
         result["recording"],

@@ -83,7 +83,11 @@ def run(
 
 
 def format_table(rows: list[Row]) -> str:
-    """A row per scene and paradigm, a column per number of robots: worst overlap, slowest and fastest robot."""
+    """A row per scene and paradigm, a column per number of robots: worst overlap, slowest and fastest robot.
+
+    Args:
+        rows: of scenes, paradigms and numbers of robots; "refused" where no plan was found.
+    """
     numbers = sorted({row["robots"] for row in rows})
     by_figure: dict[tuple[str, str], dict[int, list[Row]]] = {}
     for row in rows:

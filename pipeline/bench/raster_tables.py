@@ -11,7 +11,11 @@ WHO = ["size", "Gaussians", "threads", "isa"]
 
 
 def format_tables(result: dict[str, Any]) -> str:
-    """The result of `run` as Markdown."""
+    """The result of `run` as Markdown.
+
+    Args:
+        result: of `raster.run`.
+    """
     rows: list[dict[str, Any]] = result["rows"]
     first_of_scene = {(row["width"], row["height"], row["gaussians"]): row for row in reversed(rows)}
     counted = [TITLES[name] for name in FLOPS]

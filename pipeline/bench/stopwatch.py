@@ -25,7 +25,11 @@ class Stopwatch:
     """Times every call of named functions for as long as it is open; a function that is not there is an error."""
 
     def __init__(self, functions: Mapping[str, tuple[Any, str]]) -> None:
-        """functions: label to (module or class, name of the function in it)."""
+        """Take the functions; they are replaced when it is opened.
+
+        Args:
+            functions: by label: module or class, and name of the function in it.
+        """
         self.calls = {label: Calls() for label in functions}
         self._functions = dict(functions)
         self._open = ExitStack()
@@ -45,7 +49,13 @@ class Stopwatch:
 def replaced(
     owner: Any, name: str, change: Callable[[Callable[..., Any]], Callable[..., Any]]
 ) -> Iterator[None]:
-    """Put `change` of a function in its place, for as long as the context is open."""
+    """Put `change` of a function in its place, for as long as the context is open.
+
+    Args:
+        owner: module or class.
+        name: of the function in it.
+        change: makes the function that stands in its place.
+    """
     original = inspect.getattr_static(owner, name)
     if isinstance(original, staticmethod | classmethod):
         setattr(owner, name, type(original)(change(original.__func__)))
@@ -74,6 +84,9 @@ def summary(calls: Calls) -> dict[str, float]:
     """Milliseconds of a call: mean, median, 95th percentile and the means of the first and the last quarter.
 
     Means are those of processor time; `wall_ms` is the mean of wall time.
+
+    Args:
+        calls: one at least, seconds.
     """
     ms = 1000 * np.array(calls.cpu_s)
     quarter = max(1, len(ms) // 4)
@@ -96,7 +109,11 @@ class Work:
     after: list[int] = field(default_factory=list)
 
     def summary(self, name: str) -> dict[str, float]:
-        """Mean per call, in the first and in the last quarter of the calls."""
+        """Mean per call, in the first and in the last quarter of the calls.
+
+        Args:
+            name: of what is counted; begins the names of the result.
+        """
         counts = np.diff(np.array([0, *self.after]))
         quarter = max(1, len(counts) // 4)
         return {
@@ -110,7 +127,16 @@ class Work:
 def counted(
     whole: tuple[Any, str], part: tuple[Any, str], amount: Callable[..., int] = lambda *_: 1
 ) -> Iterator[Work]:
-    """Add up `amount` of the calls of a part, their result and arguments, while the whole runs; noted when it ends."""
+    """Add up `amount` of the calls of a part, their result and arguments, while the whole runs; noted when it ends.
+
+    Args:
+        whole: module or class, and name of the function during which is counted.
+        part: the same of the function that is counted.
+        amount: by result and arguments of a call of the part.
+
+    Yields:
+        The counts, which grow while the context is open.
+    """
     work = Work()
 
     def counting(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -137,6 +163,11 @@ def counted(
 
 
 def shares(whole: Calls, parts: Mapping[str, Calls]) -> dict[str, float]:
-    """Milliseconds of processor time that parts of a call take of it on average, and what is left."""
+    """Milliseconds of processor time that parts of a call take of it on average, and what is left.
+
+    Args:
+        whole: calls of the whole, one at least.
+        parts: calls of its parts, by label.
+    """
     found = {label: 1000 * sum(calls.cpu_s) / len(whole.cpu_s) for label, calls in parts.items()}
     return found | {"other": 1000 * sum(whole.cpu_s) / len(whole.cpu_s) - sum(found.values())}

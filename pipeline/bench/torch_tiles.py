@@ -14,6 +14,11 @@ TILE_PX = 16
 
 
 def tensors_of(room: Gaussians) -> dict[str, Any]:
+    """Parameters of Gaussians as tensors that take gradients, by name.
+
+    Args:
+        room: the Gaussians.
+    """
     import torch
 
     names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
@@ -21,7 +26,13 @@ def tensors_of(room: Gaussians) -> dict[str, Any]:
 
 
 def draw(parameters: dict[str, Any], camera: PinholeCamera, T_camera_map: np.ndarray) -> Any:
-    """Color and depth [H, W, 4] by the reference's formulas, tile by tile, in float32; differentiable."""
+    """Color and depth [H, W, 4] by the reference's formulas, tile by tile, in float32; differentiable.
+
+    Args:
+        parameters: of `tensors_of`.
+        camera: that draws.
+        T_camera_map: [4, 4].
+    """
     import torch
 
     T = torch.tensor(T_camera_map, dtype=torch.float32)

@@ -232,7 +232,11 @@ def _check_scales(
 
 
 def format_report(report: Report) -> str:
-    """The report as text for people."""
+    """The report as text for people.
+
+    Args:
+        report: of `check`.
+    """
     out = []
     for robot, row in report.robots.items():
         depth = row["depth_m"]

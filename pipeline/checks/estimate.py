@@ -61,7 +61,12 @@ def _seconds(rows: Sequence[Mapping[str, Any]], ratios: Mapping[str, float]) -> 
 
 
 def check_disk(folder: Path, needed: float) -> Iterator[Finding]:
-    """A finding if the disk of a folder has too little room."""
+    """A finding if the disk of a folder has too little room.
+
+    Args:
+        folder: whose disk is looked at.
+        needed: bytes for a run and its store.
+    """
     free = shutil.disk_usage(folder).free
     if free < needed:
         yield Finding(

@@ -61,7 +61,11 @@ class Report:
     estimate: dict[str, float] = field(default_factory=dict)
 
     def of(self, severity: Severity) -> list[Finding]:
-        """The findings of one severity."""
+        """The findings of one severity.
+
+        Args:
+            severity: of the wanted findings.
+        """
         return [finding for finding in self.findings if finding.severity is severity]
 
     @property
@@ -75,7 +79,11 @@ class Report:
 
 
 def lines(findings: Iterable[Finding]) -> list[str]:
-    """The findings as text, the most severe first."""
+    """The findings as text, the most severe first.
+
+    Args:
+        findings: in any order; of equal severity they stay in theirs.
+    """
     order = list(Severity)
     return [f.line() for f in sorted(findings, key=lambda f: order.index(f.severity))]
 

@@ -24,7 +24,13 @@ LESS = 0.99  # of another residual: less by more than rounding
 
 
 def check_camera(robot: str, camera: PinholeCamera, config: CameraChecks) -> Iterator[Finding]:
-    """Findings about the intrinsics alone."""
+    """Findings about the intrinsics alone.
+
+    Args:
+        robot: whose camera it is.
+        camera: of its color images, pixels.
+        config: thresholds.
+    """
     for axis, center, size in (("cx", camera.cx, camera.width), ("cy", camera.cy, camera.height)):
         if abs(center - (size - 1) / 2) > config.max_off_center * size:
             yield Finding(
@@ -57,7 +63,13 @@ def check_camera(robot: str, camera: PinholeCamera, config: CameraChecks) -> Ite
 
 
 def check_moves(robot: str, found: list[Move], config: MotionChecks) -> Iterator[Finding]:
-    """Findings about depth moved into later frames."""
+    """Findings about depth moved into later frames.
+
+    Args:
+        robot: whose frames they are.
+        found: pairs of near frames; none: no findings.
+        config: thresholds.
+    """
     registered = [move for move in found if move.T_first_second is not None]
     if found and len(registered) < config.min_registered * len(found):
         yield Finding(
@@ -97,7 +109,15 @@ def check_moves(robot: str, found: list[Move], config: MotionChecks) -> Iterator
 def check_range(
     robot: str, sight: Sight, found: list[Move], sensors: str, *, config: MotionChecks
 ) -> Iterator[Finding]:
-    """Findings about distances and speeds that nothing else contradicts. sensors: what the log says about them."""
+    """Findings about distances and speeds that nothing else contradicts.
+
+    Args:
+        robot: whose frames they are.
+        sight: what some frames show.
+        found: pairs of near frames.
+        sensors: what the log says about them, as text.
+        config: thresholds.
+    """
     _, middle, high = sight.depth_m
     low_m, high_m = config.median_depth_m
     middles, highs = sight.depth_of_frames[:, 1], sight.depth_of_frames[:, 2]
@@ -164,7 +184,12 @@ class DepthEdges:
 
 
 def edges_of(log: RgbdLog, config: EdgeChecks) -> DepthEdges | None:
-    """How well edges of depth fall on edges of gray; None if the log is short or has no edges."""
+    """How well edges of depth fall on edges of gray; None if the log is short or has no edges.
+
+    Args:
+        log: of the robot.
+        config: number of frames, shifts (frames, pixels), step of depth that is an edge.
+    """
     frames, shifts, reach = len(log), config.shift_frames, config.shift_px
     if frames < 2 * shifts + 2:
         return None
@@ -211,7 +236,13 @@ def _depth_edges(depth_m: Image, step: float) -> NDArray[np.bool_]:
 
 
 def check_edges(robot: str, edges: DepthEdges | None, config: EdgeChecks) -> Iterator[Finding]:
-    """Findings about depth that is not of the time, or not of the place, of its color."""
+    """Findings about depth that is not of the time, or not of the place, of its color.
+
+    Args:
+        robot: whose frames they are.
+        edges: of `edges_of`; None: no findings.
+        config: thresholds.
+    """
     if edges is None or edges.windows < config.frames // 2:
         return
     shifts, reach = config.shift_frames, config.shift_px

@@ -50,7 +50,11 @@ class Repeats:
     _last: int = -1
 
     def add(self, record: Record) -> None:
-        """Take in the next image."""
+        """Take in the next image.
+
+        Args:
+            record: of the topic, in the order of the log.
+        """
         image = record.proto()
         digest = image_digest(image.data)
         empty = len(image.data) > 0 and not image.data.strip(b"\0")
@@ -65,7 +69,15 @@ class Repeats:
 
 
 def read_repeats(log: LogFile, robot: str) -> dict[str, Repeats]:
-    """Read every image of a robot once, in the order of the log."""
+    """Read every image of a robot once, in the order of the log.
+
+    Args:
+        log: of the robot.
+        robot: its name.
+
+    Returns:
+        What repeats, by topic: color, depth and raw depth, those that have messages.
+    """
     names = [row.of(robot) for row in (topic_table.COLOR, topic_table.DEPTH, topic_table.RAW_DEPTH)]
     found = {name: Repeats() for name in names if log.entries(name)}
     total = sum(len(log.entries(name)) for name in found)
@@ -75,7 +87,14 @@ def read_repeats(log: LogFile, robot: str) -> dict[str, Repeats]:
 
 
 def check_repeats(robot: str, topic: str, repeats: Repeats, config: ImageChecks) -> Iterator[Finding]:
-    """Findings about images that come again, and about empty ones."""
+    """Findings about images that come again, and about empty ones.
+
+    Args:
+        robot: whose images they are.
+        topic: of the images.
+        repeats: of that topic.
+        config: thresholds.
+    """
     count = len(repeats.stamps_ns)
     if 0 < repeats.empty < count:
         yield Finding(
@@ -215,7 +234,13 @@ def _percentiles(depth: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def check_sight(robot: str, sight: Sight, config: ImageChecks) -> Iterator[Finding]:
-    """Findings about missing and saturated depth."""
+    """Findings about missing and saturated depth.
+
+    Args:
+        robot: whose frames they are.
+        sight: what some of them show.
+        config: thresholds.
+    """
     if sight.known == 0:
         yield Finding(
             Severity.ERROR,
@@ -280,7 +305,12 @@ def check_light(robot: str, sight: Sight, max_saturated: float) -> Iterator[Find
 
 
 def check_colors(sights: Mapping[str, Sight], config: ImageChecks) -> Iterator[Finding]:
-    """Robots whose colors agree far better with red and blue exchanged: one of them has them in the wrong order."""
+    """Robots whose colors agree far better with red and blue exchanged: one of them has them in the wrong order.
+
+    Args:
+        sights: what some frames show, by robot.
+        config: thresholds.
+    """
     for a, b in combinations(sorted(sights), 2):
         one, other = sights[a].colors, sights[b].colors
         as_is, swapped = _distance(one, other), _distance(one, other.transpose(2, 1, 0))

@@ -12,7 +12,14 @@ from duagc.pipeline.recording.pairing import Pairing
 
 
 def check_stamps(robot: str, topic: str, stamps_ns: Sequence[int], config: TimeChecks) -> Iterator[Finding]:
-    """Findings about the times of one topic's images, in the order of the log."""
+    """Findings about the times of one topic's images, in the order of the log.
+
+    Args:
+        robot: whose images they are.
+        topic: of the images.
+        stamps_ns: publish times, ns.
+        config: thresholds.
+    """
     times = np.asarray(stamps_ns, dtype=np.int64)
     steps = np.diff(times)
     back, twice = int((steps < 0).sum()), len(times) - len(np.unique(times))
@@ -62,7 +69,13 @@ def check_stamps(robot: str, topic: str, stamps_ns: Sequence[int], config: TimeC
 
 
 def check_pairs(robot: str, pairing: Pairing, config: TimeChecks) -> Iterator[Finding]:
-    """Findings about which depth belongs to which color."""
+    """Findings about which depth belongs to which color.
+
+    Args:
+        robot: whose images they are.
+        pairing: of its color and depth images.
+        config: thresholds.
+    """
     frames, alone = len(pairing.pairs), len(pairing.color_alone)
     own = len({depth for _, depth in pairing.pairs if depth is not None})
     few = own < config.min_paired * frames

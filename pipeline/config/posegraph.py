@@ -75,7 +75,18 @@ def settings(
     seed: int = 0,
     max_rounds: int = 5000,
 ) -> PoseGraphConfig:
-    """Settings of the command line."""
+    """Settings of the command line.
+
+    Args:
+        solver: of the distributed problem.
+        robust: "gnc": loop closures get robust weights; "none": all count.
+        loss: probability that a packet is lost, 0..1.
+        seed: of all random streams.
+        max_rounds: after which the run ends.
+
+    Raises:
+        pydantic.ValidationError: a value out of range.
+    """
     default = PoseGraphConfig()
     consensus = default.consensus
     if robust == "gnc":  # penalties stay as they are while weights change, and long chains want small ones

@@ -53,7 +53,11 @@ class MapLossConfig(Config):
     """Of Gaussians that are drawn with the depth of their planes."""
 
     def of(self, depth: DepthKind) -> LossConfig:
-        """The loss of maps of a kind."""
+        """The loss of maps of a kind.
+
+        Args:
+            depth: kind of depth that the Gaussians are drawn with.
+        """
         return self.ray_plane if depth == "ray_plane" else self.blended
 
 
@@ -86,5 +90,9 @@ class LearningRates(Config):
     """Logits of the opacity."""
 
     def times(self, factor: float) -> LearningRates:
-        """All rates scaled."""
+        """All rates scaled.
+
+        Args:
+            factor: on all rates.
+        """
         return LearningRates(**{name: rate * factor for name, rate in self.model_dump().items()})

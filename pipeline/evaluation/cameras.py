@@ -13,7 +13,15 @@ VALUES = ("gain", "offset", "sigma_gain", "sigma_offset")
 
 
 def section(robot: RobotRun) -> dict[str, Any]:
-    """What this robot's camera makes of a color c of the first robot of its component: gain * c + offset."""
+    """What this robot's camera makes of a color c of the first robot of its component: gain * c + offset.
+
+    Args:
+        robot: whose camera it is.
+
+    Returns:
+        Gain and offset per channel (colors 0..1) with their standard deviations, and "matches"; Absent
+        without a first robot to compare with.
+    """
     first = robot.component[0]
     names = [f"{value}_{channel}" for value in VALUES for channel in CHANNELS]
     seen = read_peer_colors(robot.folder / "fused.mcap", robot.robot).get(first)

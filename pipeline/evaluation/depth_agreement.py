@@ -64,7 +64,13 @@ class PairMedians:
 def pair_medians(
     depths_m: Sequence[Depth], camera: PinholeCamera, trajectories: Mapping[str, Array]
 ) -> PairMedians:
-    """What `depth_agreement` takes the median of."""
+    """What `depth_agreement` takes the median of.
+
+    Args:
+        depths_m: [h, w] of every view, meters along z, 0 = unknown.
+        camera: of the views.
+        trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
+    """
     inverse = [np.where(d > 0, 1 / np.where(d > 0, d, 1), np.nan) for d in depths_m]
     images = [(i, _points(d, camera)) for i, d in zip(inverse, depths_m, strict=True)]
     pairs: list[tuple[int, int]] = []

@@ -103,7 +103,14 @@ def feature_agreement(
 
 
 def match_views(ours: Features, theirs: Features, a: int, b: int) -> MatchedPair | None:
-    """Two views by the matches that agree on one motion; None if too few do."""
+    """Two views by the matches that agree on one motion; None if too few do.
+
+    Args:
+        ours: features of the first view, points in its camera frame, meters.
+        theirs: of the second.
+        a: place of the first view among all; it also names the random stream of the motion.
+        b: place of the second.
+    """
     pairs = matches(ours.descriptors, theirs.descriptors, RATIO)
     if len(pairs) < MIN_MATCHES:
         return None

@@ -26,7 +26,18 @@ from duagc.schemas import topics
 
 
 def trajectory(recording: Recording, robot: str) -> Trajectory | Absent:
-    """T_gt_camera of the robot's color camera, in the ground-truth world that all robots share."""
+    """T_gt_camera of the robot's color camera, in the ground-truth world that all robots share.
+
+    Args:
+        recording: with or without ground truth.
+        robot: name, or the name of one of its components.
+
+    Returns:
+        Poses [n, 4, 4] by stamp in ns; Absent if there is no file, or no pose in it.
+
+    Raises:
+        DuagError: the recording has no such robot, or the file is damaged.
+    """
     path = recording.groundtruth(robot)
     if path is None:
         return Absent(f"the recording has no ground truth of {robot}")
@@ -40,7 +51,16 @@ def trajectory(recording: Recording, robot: str) -> Trajectory | Absent:
 def exact_depths(
     recording: Recording, robot: str, stamps_ns: Collection[int]
 ) -> dict[int, NDArray[np.float32]] | Absent:
-    """Exact depth images [h, w] in meters by time stamp, for those of the wanted stamps that have one."""
+    """Exact depth images [h, w] in meters by time stamp, for those of the wanted stamps that have one.
+
+    Args:
+        recording: with or without ground truth.
+        robot: name, or the name of one of its components.
+        stamps_ns: of the wanted images.
+
+    Raises:
+        DuagError: the recording has no such robot, or the file is damaged.
+    """
     path, topic = recording.groundtruth(robot), topics.GROUNDTRUTH_DEPTH.of(robot_of(robot))
     if path is None:
         return Absent(f"the recording has no ground truth of {robot}")
@@ -57,7 +77,16 @@ def exact_depths(
 def static_masks(
     recording: Recording, robot: str, stamps_ns: Collection[int]
 ) -> dict[int, NDArray[np.bool_]]:
-    """Where nothing moves [h, w], by time stamp, of the wanted stamps; none where the log has the masks itself."""
+    """Where nothing moves [h, w], by time stamp, of the wanted stamps; none where the log has the masks itself.
+
+    Args:
+        recording: with or without ground truth.
+        robot: name, or the name of one of its components.
+        stamps_ns: of the wanted masks.
+
+    Raises:
+        DuagError: the recording has no such robot, or the file is damaged.
+    """
     path, topic = recording.groundtruth(robot), topics.GROUNDTRUTH_MASK.of(robot_of(robot))
     if path is None:
         return {}
@@ -72,6 +101,13 @@ def recorded_depth_is_exact(recording: Recording, robot: str) -> bool:
     """Whether the depth in the robot's log is the true one: a simulated sensor without noise.
 
     Such depth may still be late, in steps or seen through a lens; then the ground truth has the exact depth apart.
+
+    Args:
+        recording: with or without ground truth.
+        robot: name, or the name of one of its components.
+
+    Raises:
+        DuagError: the recording has no such robot, or its file of ground truth is damaged.
     """
     sensors = recording.description["robots"][robot_of(robot)].get("sensors") or {}
     if sensors.get("depth_noise") != "none":
@@ -84,7 +120,12 @@ def recorded_depth_is_exact(recording: Recording, robot: str) -> bool:
 
 
 def knows_rotations(recording: Recording, robot: str) -> bool:
-    """Whether the rotations of the true poses mean anything; satellite positions, for example, have none."""
+    """Whether the rotations of the true poses mean anything; satellite positions, for example, have none.
+
+    Args:
+        recording: whose description says it.
+        robot: name, or the name of one of its components.
+    """
     sensors = recording.description["robots"][robot_of(robot)].get("sensors") or {}
     return sensors.get("truth") != "position"
 
@@ -120,16 +161,23 @@ class Surface:
     normals: NDArray[np.float64]
 
     def closest(self, queries: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distance (m) [m] of every query [m, 3] from the surface, and unit normal [m, 3] of the surface there.
+        """Distance [m] of every query from the surface, meters, and unit normal [m, 3] of the surface there.
 
-        A disc is as wide as the points are apart, and the nearest disc counts, so that the distance is not blurred
-        by the sampling.
+        A disc is as wide as the points are apart, and the nearest disc counts, so that the distance is not
+        blurred by the sampling.
+
+        Args:
+            queries: points [m, 3], meters, ground-truth world.
         """
         index, _, distance = self._nearest_disc(queries)
         return distance, self.normals[index]
 
     def nearest(self, queries: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Queries [m, 3], each moved along the normal into the plane of the disc that is nearest to it."""
+        """Queries, each moved along the normal into the plane of the disc that is nearest to it.
+
+        Args:
+            queries: points [m, 3], meters, ground-truth world.
+        """
         index, across, _ = self._nearest_disc(queries)
         return queries - across[:, None] * self.normals[index]
 
@@ -161,6 +209,9 @@ class Surface:
 def surface(recording: Recording) -> Surface | Absent:
     """The geometry of the scene, from groundtruth.ply next to the logs.
 
+    Args:
+        recording: with or without geometry.
+
     Raises:
         DuagError: not a binary .ply of points with normals, cut short, or values that are not finite.
     """
@@ -180,6 +231,9 @@ def surface(recording: Recording) -> Surface | Absent:
 
 def check(recording: Recording) -> None:
     """Look at every file of ground truth once, before hours are spent on a run that could not be evaluated.
+
+    Args:
+        recording: with or without ground truth.
 
     Raises:
         DuagError: a file that is there is damaged.

@@ -63,9 +63,14 @@ def map_errors(gaussian_map: GaussianMap, surface: Surface, T_gt_map: Array) -> 
 
 
 def scores(errors: MapErrors, robot: str) -> dict[str, Any]:
-    """All calibration numbers of one map, in the names of metrics.json; `robot` names the random stream.
+    """All calibration numbers of one map, in the names of metrics.json.
 
-    The scale of `nll_scaled` and `coverage_95_scaled` is fitted on every second Gaussian and judged on the others.
+    The scale of `nll_scaled` and `coverage_95_scaled` is fitted on every second Gaussian and judged on the
+    others.
+
+    Args:
+        errors: of the Gaussians that have full position information.
+        robot: whose map it is; it names the random streams and stands in the reason of absent values.
     """
     n = len(errors.error_m)
     if n < MIN_GAUSSIANS:

@@ -120,7 +120,11 @@ class Link:
 
 
 def is_inlier(decision: Any) -> bool:
-    """Whether a loop closure is an inlier in the end: it took part, and the robust weight did not turn it off."""
+    """Whether a loop closure is an inlier in the end: it took part, and the robust weight did not turn it off.
+
+    Args:
+        decision: duagc.v1.LoopClosureDecision.
+    """
     return decision.weight >= INLIER_WEIGHT
 
 
@@ -128,12 +132,19 @@ def measured(decision: Any) -> bool:
     """Whether a candidate got as far as geometry: a motion between the two keyframes was sought and some matches fit.
 
     Keyframes that resemble nothing, or that the budget of requests left out, did not.
+
+    Args:
+        decision: duagc.v1.LoopClosureDecision.
     """
     return decision.measured or decision.inliers > 0
 
 
 def follows_moved(decision: Any) -> bool:
-    """Whether a candidate shows something that moved between the recordings of two robots."""
+    """Whether a candidate shows something that moved between the recordings of two robots.
+
+    Args:
+        decision: duagc.v1.LoopClosureDecision.
+    """
     from duagc.pipeline.exchange.verification import Verdict
 
     return bool(decision.verdict == Verdict.SOMETHING_MOVED.value)
@@ -143,6 +154,11 @@ class Session:
     """The two logs of the exchange of one run; each is read when it is asked for, and once."""
 
     def __init__(self, run: RunFolder) -> None:
+        """Take the run; its logs are read later.
+
+        Args:
+            run: with exchange.mcap and consensus.mcap.
+        """
         self.run = run
 
     def _records(self, name: str, *of: topics.Topic) -> Iterator[Record]:

@@ -188,7 +188,12 @@ def used_matches(robot: RobotRun, pairs: Pairs) -> Pairs:
 
 
 def pose_gap(poses: Mapping[str, Array], central: Mapping[str, Array]) -> tuple[float, float]:
-    """Largest distance (m) and angle (rad) between two sets of keyframes [n, 4, 4] by robot."""
+    """Largest distance (m) and angle (rad) between two sets of keyframes [n, 4, 4] by robot.
+
+    Args:
+        poses: T_world_keyframe [n, 4, 4] of the robots' own answer.
+        central: the same of the centralized answer; it has every robot of `poses`.
+    """
     apart = [se3.distance(central[name], poses[name]) for name in poses]
     return max(float(np.max(m)) for m, _ in apart), max(float(np.max(r)) for _, r in apart)
 

@@ -38,6 +38,13 @@ def paths(run: RunFolder, recording: Recording) -> list[Path3]:
     """The ways of all robots, in order of their names.
 
     The ground truth of a component is aligned jointly if it has two robots or more, otherwise robot by robot.
+
+    Args:
+        run: whose trajectories are drawn.
+        recording: of the run, for its ground truth.
+
+    Raises:
+        DuagError: a file of ground truth is damaged.
     """
     truth = {robot: groundtruth.trajectory(recording, robot) for robot in run.robots}
     pairs_of = {
@@ -73,9 +80,12 @@ def _put_at_start(before: Trajectory, after: Trajectory) -> Trajectory:
 
 
 def top_view_axes(poses: Array) -> Array:
-    """Two unit vectors [2, 3] that span the plane seen from above: across the mean vertical of the cameras [n, 4, 4].
+    """Two unit vectors [2, 3] that span the plane seen from above: across the mean vertical of the cameras.
 
     Right is the direction in which the positions spread most; the other completes it, seen from above.
+
+    Args:
+        poses: T_world_camera [n, 4, 4], y of the camera pointing down.
     """
     up = -poses[:, :3, 1].mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-9 else np.array([0.0, 0.0, 1.0])

@@ -102,7 +102,12 @@ def stated_in_world(robot: RobotRun, shown: GaussianMap) -> StatedMap:
 
 
 def own_in_world(robot: RobotRun, own: StatedMap) -> StatedMap:
-    """The own map where consensus puts its keyframes: what is stated along a normal moves with it."""
+    """The own map where consensus puts its keyframes: what is stated along a normal moves with it.
+
+    Args:
+        robot: whose keyframes move the map.
+        own: its own map in the map frame (`stated_own`).
+    """
     return StatedMap(in_world(robot, "own", own.gaussians), own.sigma_m, own.depth)
 
 

@@ -211,7 +211,11 @@ def _scores(errors: Sequence[PixelErrors], name: str, reason_if_none: str) -> di
 
 
 def team_scores(robots: Collection[Scores]) -> Scores:
-    """Means over the robots; counts add up."""
+    """Means over the robots; counts add up.
+
+    Args:
+        robots: scores of every robot, one at least.
+    """
     return {
         kind: {s: {key: _together(key, [r[kind][s][key] for r in robots]) for key in NAMES} for s in SETS}
         for kind in MAPS

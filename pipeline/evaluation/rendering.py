@@ -214,7 +214,12 @@ def rendering_sections(of_robots: Mapping[str, Sequence[Scored]], *, longer: boo
 
 
 def mates(run: RunFolder, robot: RobotRun) -> list[RobotRun]:
-    """The other robots that agree with this one on who shares their world; its own other components are none."""
+    """The other robots that agree with this one on who shares their world; its own other components are none.
+
+    Args:
+        run: with all robots.
+        robot: one of them.
+    """
     others = [run.robots[r] for r in robot.component if not same_robot(r, robot.robot)]
     return [other for other in others if other.component == robot.component]
 
@@ -235,7 +240,14 @@ def _own_trajectory(robot: RobotRun, kind: str) -> Trajectory:
 
 
 def in_world(robot: RobotRun, kind: str, gaussians: Gaussians) -> Gaussians:
-    """A map of `_maps` in the world: Gaussians of the own maps move with their keyframes."""
+    """A map of `_maps` in the world: Gaussians of the own maps move with their keyframes.
+
+    Args:
+        robot: whose map it is; its corrected keyframes move it.
+        kind: name of the map ("own", "own_longer", "fused", ...); a name that begins with "own" is in the map
+            frame.
+        gaussians: of that map, meters, in the map frame or already in the world.
+    """
     if not kind.startswith("own"):
         return gaussians
     T_map_keyframe = np.array([k.T_map_camera for k in robot.keyframes])
@@ -243,7 +255,12 @@ def in_world(robot: RobotRun, kind: str, gaussians: Gaussians) -> Gaussians:
 
 
 def in_colors_of(colors: ColorMap | None, gaussians: Gaussians) -> Gaussians:
-    """A map of a robot in a peer's colors, by how those look to the robot; None: as if both cameras were alike."""
+    """A map of a robot in a peer's colors, by how those look to the robot.
+
+    Args:
+        colors: from the peer's colors to the robot's; None: as if both cameras were alike.
+        gaussians: of the robot's map, colors 0..1.
+    """
     if colors is None or colors.is_identity:
         return gaussians
     return gaussians.replace(colors=colors.from_other(gaussians.colors).astype(np.float32))
@@ -267,7 +284,14 @@ class RenderTask:
     def scores(
         self, source: Recording, threads: int, title: str | None, *, skip: int = 0
     ) -> Iterator[tuple[int, dict[str, views.ViewScore | Absent]]]:
-        """Frame index and the maps' scores of every view but the first `skip`, in order; progress under `title`."""
+        """Frame index and the maps' scores of every view, in order.
+
+        Args:
+            source: the recording.
+            threads: views rendered at the same time; changes no bit of the result.
+            title: of the progress on standard error; None: no progress.
+            skip: number of views at the start that are left out.
+        """
         name, robot = self.camera_robot.robot, self.camera_robot
         chosen = self.chosen()[skip:]
         with open_rgbd(source.log(name)) as log:
@@ -281,12 +305,21 @@ class RenderTask:
 
 
 def held_out_of(robot: RobotRun) -> frozenset[int]:
-    """Held-out frames of a robot, lost ones too, but none of its other components: those are theirs to score."""
+    """Held-out frames of a robot, lost ones too, but none of its other components: those are theirs to score.
+
+    Args:
+        robot: with its frames and held-out frames.
+    """
     return robot.held_out - {f.frame_index for f in robot.frames if f.reason == OTHER_COMPONENT}
 
 
 def spread(frames: Collection[int], most: int) -> list[int]:
-    """At most so many of the frames, evenly spread, in order."""
+    """At most so many of the frames, evenly spread, in order.
+
+    Args:
+        frames: indices, in any order.
+        most: largest number of frames returned.
+    """
     in_order = sorted(frames)
     return [in_order[k] for k in evenly_spaced(len(in_order), min(most, len(in_order)))]
 
@@ -326,7 +359,11 @@ def scored_frames(
 
 
 def poses_by_stamp(trajectory: Trajectory) -> dict[int, NDArray[np.float64]]:
-    """Poses [4, 4] by time stamp in ns."""
+    """Poses [4, 4] by time stamp in ns.
+
+    Args:
+        trajectory: poses [n, 4, 4] and stamps in ns.
+    """
     return dict(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True))
 
 

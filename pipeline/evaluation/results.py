@@ -129,6 +129,10 @@ def reason_of(grouped: Mapping[str, Sequence[str]], name: str) -> str:
     """Why the value of a dotted name is absent; "" if no reason names it.
 
     The name itself counts before a key anywhere (`*.lpips`), and that before a pattern with a prefix.
+
+    Args:
+        grouped: patterns by reason, as `group_reasons` writes them.
+        name: dotted name of the value.
     """
     for reason, patterns in grouped.items():
         if name in patterns:
@@ -141,7 +145,12 @@ def reason_of(grouped: Mapping[str, Sequence[str]], name: str) -> str:
 
 
 def leaves(tree: Mapping[str, Any], prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """(path, value) of every leaf of nested mappings, in order."""
+    """(path, value) of every leaf of nested mappings, in order.
+
+    Args:
+        tree: nested mappings.
+        prefix: path of `tree` itself; it stands before every path.
+    """
     for key, child in tree.items():
         if isinstance(child, Mapping):
             yield from leaves(child, (*prefix, key))
@@ -150,7 +159,11 @@ def leaves(tree: Mapping[str, Any], prefix: tuple[str, ...] = ()) -> Iterator[tu
 
 
 def mean(values: list[float | Absent]) -> float | Absent:
-    """Mean of the values that exist; the first reason if none does."""
+    """Mean of the values that exist; the first reason if none does.
+
+    Args:
+        values: numbers and Absent, in any mix.
+    """
     numbers = [v for v in values if not isinstance(v, Absent)]
     if numbers:
         return math.fsum(numbers) / len(numbers)
@@ -158,7 +171,11 @@ def mean(values: list[float | Absent]) -> float | Absent:
 
 
 def unit_of(name: str) -> str:
-    """The unit of a metric, from the words of its name; "1" for counts, shares and scores."""
+    """The unit of a metric, from the words of its name; "1" for counts, shares and scores.
+
+    Args:
+        name: of the metric, as in metrics.json, without its path.
+    """
     words = name.removesuffix("_p99").split("_")
     if words[0] in ("bytes", "nll"):
         return {"bytes": "B", "nll": "nat"}[words[0]]
@@ -180,14 +197,27 @@ class Row:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a document of finite numbers; the name appears only when the file is complete."""
+    """Write a document of finite numbers; the name appears only when the file is complete.
+
+    Args:
+        path: of the file; replaced if it exists.
+        document: numbers, texts and None in nested mappings and lists.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
     with new_file(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 def write_parquet(path: Path, rows: list[Row]) -> None:
-    """Write the long table: scope, robot, view_set, frame_index (null: not of one view), name, value, unit, reason."""
+    """Write the long table: scope, robot, view_set, frame_index (null: not of one view), name, value, unit, reason.
+
+    Args:
+        path: of the file; replaced if it exists.
+        rows: of the table, in order.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -40,6 +40,10 @@ def pair(true: Trajectory, estimated: Trajectory) -> Paired:
     """Pair every estimated pose with the nearest ground-truth pose within 20 ms; poses without one are left out.
 
     Where truth is sparser than the frames, each of its poses goes to the frame that is nearest to it.
+
+    Args:
+        true: T_gt_camera, stamps in ns.
+        estimated: T_frame_camera of the same camera.
     """
     i, j = associate(estimated, true, ASSOCIATION_TOLERANCE_NS)
     first, nearest = associate(true, estimated, ASSOCIATION_TOLERANCE_NS)
@@ -48,7 +52,11 @@ def pair(true: Trajectory, estimated: Trajectory) -> Paired:
 
 
 def alignment(pairs: list[Paired]) -> Array | Absent:
-    """T_gt_frame [4, 4], the one SE(3) that brings all pairs onto the ground truth; Absent if not determined."""
+    """T_gt_frame [4, 4], the one SE(3) that brings all pairs onto the ground truth; Absent if not determined.
+
+    Args:
+        pairs: of one or more cameras, all estimated in one frame.
+    """
     true = np.concatenate([p.true[:, :3, 3] for p in pairs]) if pairs else np.zeros((0, 3))
     estimated = np.concatenate([p.estimated[:, :3, 3] for p in pairs]) if pairs else np.zeros((0, 3))
     try:
@@ -58,13 +66,22 @@ def alignment(pairs: list[Paired]) -> Array | Absent:
 
 
 def squared_errors_m2(pairs: Paired, T_gt_frame: Array) -> Array:
-    """Squared distance of every aligned position from the true one, m^2 [n]."""
+    """Squared distance of every aligned position from the true one, m^2 [n].
+
+    Args:
+        pairs: of one camera.
+        T_gt_frame: [4, 4], the alignment.
+    """
     difference = pairs.true[:, :3, 3] - se3.transform(T_gt_frame, pairs.estimated[:, :3, 3])
     return np.sum(difference**2, axis=1)
 
 
 def ate_rmse_m(pairs: Paired) -> float | Absent:
-    """Root mean squared position error after the robot's own SE(3) alignment, all paired frames, meters."""
+    """Root mean squared position error after the robot's own SE(3) alignment, all paired frames, meters.
+
+    Args:
+        pairs: of one robot.
+    """
     T_gt_frame = alignment([pairs])
     if isinstance(T_gt_frame, Absent):
         return T_gt_frame
@@ -111,6 +128,9 @@ def team_error(pairs_of: Mapping[str, Paired]) -> TeamError | Absent:
 
     Only a joint alignment sees the error between robots: each robot may lie well by itself and the team lie apart.
     The components of a robot count as one.
+
+    Args:
+        pairs_of: paired poses by robot, all estimated in the world of the component.
     """
     robots = sorted({robot_of(name) for name in pairs_of})
     if len(robots) < 2:

@@ -18,7 +18,12 @@ Z_95 = 1.959963984540054
 
 
 def spearman(sigma_m: Array, error_m: Array) -> float:
-    """Rank correlation of predicted uncertainty and error, -1..1; 1 if the uncertainty orders the errors perfectly."""
+    """Rank correlation of predicted uncertainty and error, -1..1; 1 if the uncertainty orders the errors perfectly.
+
+    Args:
+        sigma_m: predicted standard deviations [n], meters.
+        error_m: measured errors [n], meters.
+    """
     a, b = _mean_ranks(sigma_m), _mean_ranks(error_m)
     a, b = a - a.mean(), b - b.mean()
     scale = np.sqrt(np.sum(a * a) * np.sum(b * b))
@@ -30,6 +35,10 @@ def ause(sigma_m: Array, error_m: Array) -> float:
 
     Take away the most uncertain share of the Gaussians and look at the mean error of the rest, relative to the mean
     error of all; the area between that curve and the one that takes away the largest errors first.
+
+    Args:
+        sigma_m: predicted standard deviations [n], meters.
+        error_m: absolute errors [n], meters.
     """
     mean = error_m.mean()
     if mean == 0:
@@ -47,17 +56,32 @@ def _mean_of_remaining(error_sorted_m: Array) -> Array:
 
 
 def nll(sigma_m: Array, error_m: Array) -> float:
-    """Mean negative log-likelihood of the errors under N(0, sigma^2), in nats, errors in meters; lower is better."""
+    """Mean negative log-likelihood of the errors under N(0, sigma^2), in nats, errors in meters; lower is better.
+
+    Args:
+        sigma_m: predicted standard deviations [n] > 0, meters.
+        error_m: measured errors [n], meters.
+    """
     return float(np.mean(0.5 * np.log(2.0 * np.pi * sigma_m**2) + 0.5 * (error_m / sigma_m) ** 2))
 
 
 def coverage_95(sigma_m: Array, error_m: Array) -> float:
-    """Share of errors within 1.96 predicted standard deviations; 0.95 if the prediction is right."""
+    """Share of errors within 1.96 predicted standard deviations; 0.95 if the prediction is right.
+
+    Args:
+        sigma_m: predicted standard deviations [n], meters.
+        error_m: measured errors [n], meters.
+    """
     return float(np.mean(np.abs(error_m) <= Z_95 * sigma_m))
 
 
 def fitted_scale(sigma_m: Array, error_m: Array) -> float:
-    """The factor s on sigma with the greatest likelihood: the root mean square of error / sigma; 1 if well scaled."""
+    """The factor s on sigma with the greatest likelihood: the root mean square of error / sigma; 1 if well scaled.
+
+    Args:
+        sigma_m: predicted standard deviations [n] > 0, meters.
+        error_m: measured errors [n], meters.
+    """
     return float(np.sqrt(np.mean((error_m / sigma_m) ** 2)))
 
 
@@ -65,6 +89,10 @@ def ece_rank(sigma_m: Array, error_m: Array) -> float:
     """Ten bins of equal count by predicted uncertainty; mean |mean uncertainty rank - mean error rank|, ranks 0..1.
 
     0 if the order is right, 0.25 if the uncertainty says nothing; what right ones reach: `if_right`.
+
+    Args:
+        sigma_m: predicted standard deviations [n], meters.
+        error_m: absolute errors [n], meters.
     """
     n = len(sigma_m)
     order = np.argsort(sigma_m, kind="stable")
@@ -75,7 +103,12 @@ def ece_rank(sigma_m: Array, error_m: Array) -> float:
 
 
 def shuffled(sigma_m: Array, name: str) -> Array:
-    """The same uncertainties dealt out at random (seed 0): what a metric says when there is no information."""
+    """The same uncertainties dealt out at random (seed 0): what a metric says when there is no information.
+
+    Args:
+        sigma_m: predicted standard deviations [n], meters.
+        name: of the random stream.
+    """
     return random_streams.generator(0, "calibration-shuffle", of=name).permutation(sigma_m)
 
 
@@ -97,6 +130,10 @@ def ece_paper(uncertainty: Array, error_m: Array) -> float:
     count-weighted |mean error - mean uncertainty|.
 
     It does not measure calibration: on heavy-tailed values that know nothing of each other it is near zero, too.
+
+    Args:
+        uncertainty: predicted [n], in any unit.
+        error_m: absolute errors [n], meters.
     """
     u, e = _min_max(uncertainty), _min_max(error_m)
     bins = np.minimum((u * BINS).astype(np.int64), BINS - 1)
@@ -109,7 +146,12 @@ def ece_paper(uncertainty: Array, error_m: Array) -> float:
 
 
 def reliability(sigma_m: Array, error_m: Array) -> list[tuple[float, float]]:
-    """(predicted, observed) root mean square error in meters of ten bins of equal count by predicted uncertainty."""
+    """(predicted, observed) root mean square error in meters of ten bins of equal count by predicted uncertainty.
+
+    Args:
+        sigma_m: predicted standard deviations [n], meters.
+        error_m: measured errors [n], meters.
+    """
     order = np.argsort(sigma_m, kind="stable")
     rms = [
         (float(np.sqrt(np.mean(sigma_m[order[b]] ** 2))), float(np.sqrt(np.mean(error_m[order[b]] ** 2))))

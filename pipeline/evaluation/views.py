@@ -72,7 +72,11 @@ class ComparedImage:
 
 
 def surface_depth(render: Render) -> NDArray[np.float32]:
-    """Depth [h, w] in meters of what was rendered: blended depth / alpha where alpha >= 0.5, else 0."""
+    """Depth [h, w] in meters of what was rendered: blended depth / alpha where alpha >= 0.5, else 0.
+
+    Args:
+        render: with blended depth [h, w] (meters times alpha) and alpha [h, w].
+    """
     covered = render.alpha >= MIN_ALPHA
     depth = np.zeros(render.alpha.shape, dtype=np.float32)
     depth[covered] = render.depth[covered] / render.alpha[covered]
@@ -299,6 +303,10 @@ def summary(scores: Sequence[ViewScore | Absent], reason_if_none: str) -> dict[s
     """Means over the views that were rendered, in the layout of metrics.json.
 
     A value that is absent in every view is absent in the mean, with the reason of the first view.
+
+    Args:
+        scores: of every view; Absent where the trajectory has no pose of it.
+        reason_if_none: why values are absent if no view was rendered.
     """
     rendered = [s for s in scores if not isinstance(s, Absent)]
     without = Absent(reason_if_none)

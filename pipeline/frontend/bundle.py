@@ -311,6 +311,12 @@ class Neighborhood:
     """
 
     def __init__(self, views: Sequence[KeyframeView], config: KeyframeConfig) -> None:
+        """Look at the views one by one; pairs are compared later.
+
+        Args:
+            views: of the keyframes, in their order.
+            config: least overlap, and number of neighbors.
+        """
         self._views, self._config = views, config
         self._centers, self._radii = np.zeros((len(views), 3)), np.zeros(len(views))  # camera frames
         for k, view in enumerate(views):

@@ -53,7 +53,11 @@ class KeyframeSights:
             self._poses.append(keyframe.T_map_camera)
 
     def far_m(self, keyframe: int) -> Image | None:
-        """Depth of what a keyframe saw too far away to be measured (`FarDepth.of`)."""
+        """Depth of what a keyframe saw too far away to be measured (`FarDepth.of`).
+
+        Args:
+            keyframe: number in order of arrival.
+        """
         return self._far.of(keyframe)
 
     def tiles(self) -> list[list[int]]:

@@ -144,7 +144,11 @@ class View:
         return self.half_color, self.half_depth_m
 
     def training(self, level: int) -> TrainingView:
-        """The images of a level as a training step takes them."""
+        """The images of a level as a training step takes them.
+
+        Args:
+            level: 0: full size; 1: half size.
+        """
         mask, pose, moments = self.usable(level), self.T_map_camera, self.T_camera_moment
         if level:
             return TrainingView(self.half_color, self.half_depth_m, pose, mask, self.half_certainty, moments)

@@ -105,7 +105,11 @@ class MovingView:
     velocity: Array
 
     def pose_of(self, other: MovingView) -> Array:
-        """T_view_other [4, 4] of another view."""
+        """T_view_other [4, 4] of another view.
+
+        Args:
+            other: posed in the same map.
+        """
         return np.asarray(se3.inverse(self.T_map_camera) @ other.T_map_camera)
 
 

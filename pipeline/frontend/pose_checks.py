@@ -70,6 +70,13 @@ class WellConstrained:
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
         # along weak directions a prior knows the pose, or the outcome would not be OK
+        """Reject it if its position is uncertain and something is in front of the camera.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
         covariance = np.linalg.pinv(candidate.result.information, rcond=1e-12, hermitian=True)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         if sigma_m <= state.config.tracking.failure.max_sigma_occluded_m:
@@ -89,6 +96,13 @@ class MatchesPrediction:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
+        """Reject it if it looks unlike its keyframe and is not where it was predicted.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
         tracking, result = state.config.tracking, candidate.result
         predicted = state.predict(frame.stamp_ns).T_keyframe_camera
         moved_m, turned_rad = se3.distance(predicted, result.T_reference_target)
@@ -111,6 +125,13 @@ class DepthColorConsistency:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
+        """Correct or reject it if color alone puts the camera elsewhere.
+
+        Args:
+            state: what the tracker knows; gets whether depth and color contradict each other.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
         limits = state.config.tracking.failure
         if state.last_good is None or not state.looks_worse_than_usual(candidate.result):
             return candidate
@@ -166,6 +187,13 @@ class RespectsFreeSpace:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
+        """Reject it if much of the frame is in space that its keyframe saw to be free.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
         limits, keyframe = state.config.tracking.failure, state.keyframes[candidate.keyframe_index]
         T = candidate.result.T_reference_target
         violations, visible = free_space_violations(frame.pyramid.levels[-1], keyframe.coarsest, T, limits)
@@ -178,6 +206,13 @@ class WithinReach:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
+        """Reject it if the camera cannot have come so far.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
         limits, keyframe = state.config.tracking.failure, state.keyframes[candidate.keyframe_index]
         elapsed_s = max(state.elapsed_s(frame.stamp_ns), 0.0)
         moved_m, _ = _from_prediction(state, frame, candidate)
@@ -195,6 +230,13 @@ class FeaturesConfirm:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
+        """Reject it if features are not where the keyframe has them.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
         limits, relocalization = state.config.tracking.failure, state.config.tracking.relocalization
         features = state.keyframes[candidate.keyframe_index].features
         if len(features) >= limits.min_features_of_inliers * relocalization.min_inliers:
@@ -219,6 +261,13 @@ class DoesNotFollowMovedThings:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
+        """Reject it if it follows what moved.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
         limits, features = (
             state.config.tracking.relocalization,
             state.keyframes[candidate.keyframe_index].features,
@@ -237,6 +286,13 @@ class FeaturesDoNotContradict:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
+        """Reject it if the motion that features agree on contradicts it.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
         limits, features = state.config.keyframes.judgment, state.keyframes[candidate.keyframe_index].features
         T, rng = candidate.result.T_reference_target, _draws("frame_judgment", frame, candidate)
         found = judge_motion(features, frame.features, T, config=limits, rng=rng)

@@ -200,6 +200,10 @@ class Scatter:
         """Robust spread (1.48 times the median) of members with information about their references.
 
         What the settings expect counts as much as `scatter_support` members.
+
+        Args:
+            members: of all tracks.
+            config: what is expected, and by which rule.
         """
         if config.association == "members":
             return Scatter(

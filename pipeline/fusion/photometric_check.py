@@ -28,11 +28,20 @@ class ColorStatistics:
     """Variance of colors 0..1, summed as they come."""
 
     def __init__(self, least_variance: float) -> None:
+        """Begin without colors.
+
+        Args:
+            least_variance: of colors 0..1; `variance` is never less.
+        """
         self.least_variance = least_variance
         self.pixels, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
 
     def add(self, colors: NDArray[np.float32]) -> None:
-        """Colors [..., 3]."""
+        """Take in colors.
+
+        Args:
+            colors: [..., 3], 0..1.
+        """
         c = colors.reshape(-1, 3)
         self.pixels += len(c)
         self._sum += c.sum(axis=0, dtype=np.float64)
@@ -64,6 +73,15 @@ class PhotometricCheck:
         *,
         arrived: float,
     ) -> None:
+        """Begin with nothing drawn.
+
+        Args:
+            views: own images, posed in the world.
+            context: camera, settings and threads.
+            depth_kind: depth of a Gaussian at a pixel, as the peer's map was made.
+            config: thresholds of the check.
+            arrived: share of the peer's map that arrived, 0..1.
+        """
         self.explained = config.min_explained_variance * arrived
         self.views, self.context, self.depth_kind, self.config = views, context, depth_kind, config
         self.rasterizer = Rasterizer(threads=context.threads)
@@ -76,6 +94,9 @@ class PhotometricCheck:
         """Whether the map explains own images, or blocks of them correlate with it, or too few own pixels see it.
 
         Of a map with holes as much is expected as there is of it; what is wrong explains nothing, however little it is.
+
+        Args:
+            own_px: number of all own pixels.
         """
         few = self._seen_px < self.config.min_overlap * own_px
         return self._explains or few or self._correlates
@@ -86,7 +107,12 @@ class PhotometricCheck:
         return self.color_mse <= (1 - self.explained) * self.own.variance
 
     def contradicted(self, world: Evidence, gray: float) -> NDArray[np.bool_]:
-        """Which Gaussians [n] own images contradict: error above `gray`, the variance of own colors."""
+        """Which Gaussians [n] own images contradict: their mean squared error is above `gray`.
+
+        Args:
+            world: n Gaussians of the peer, in the world of the views.
+            gray: variance of own colors 0..1.
+        """
         gaussians = gaussians_of(world.ids, world.anchors, world.theta)
         against = self._against(gaussians, world, gray)
         self._correlates = not self._explains and self._blocks_correlate(gaussians)

@@ -49,7 +49,11 @@ class DepthNoise:
         return DepthNoise(settings.depth_sigma_base_m, settings.depth_sigma_quadratic_per_m)
 
     def sigma_m(self, depth_m: NDArray[np.floating]) -> NDArray[Any]:
-        """Standard deviation of depths [...], meters, computed in their precision."""
+        """Standard deviation of depths [...], meters, computed in their precision.
+
+        Args:
+            depth_m: [...], meters along z.
+        """
         number = depth_m.dtype.type
         sigma = number(self.base_m) + number(self.quadratic_per_m) * (depth_m - number(NEAREST_M)) ** 2
         return sigma if self.factor == 1.0 else number(self.factor) * sigma

@@ -88,6 +88,10 @@ def add_covariance(information: ArrayLike, covariance: ArrayLike) -> Array:
     """(W^-1 + C)^-1 for positive semidefinite W and C [..., d, d], either may be singular.
 
     Computed as (I + W C)^-1 W, which needs no inverse of either: a direction without information stays without.
+
+    Args:
+        information: W [..., d, d].
+        covariance: C [..., d, d], in the inverse unit of W.
     """
     W, C = np.asarray(information, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     out = np.linalg.solve(np.eye(W.shape[-1]) + W @ C, W)

@@ -120,7 +120,11 @@ def associate(a: Trajectory, b: Trajectory, tolerance_ns: int) -> tuple[NDArray[
 
 
 def align(points_a: ArrayLike, points_b: ArrayLike) -> Array:
-    """T_a_b [4, 4] that minimizes sum |a - T_a_b b|^2 over paired points [n, 3] (Horn; no scale).
+    """T_a_b [4, 4] that minimizes sum |a - T_a_b b|^2 over paired points (Horn; no scale).
+
+    Args:
+        points_a: [n, 3], meters, frame a.
+        points_b: [n, 3], the same points in frame b.
 
     Raises:
         DuagError: fewer than three pairs, or points on one line: the rotation is not determined.
@@ -167,7 +171,13 @@ def _check_finite(name: str, rows: Array) -> None:
 
 
 def rpe_rmse(poses_true: ArrayLike, poses_estimated: ArrayLike, step: int = 1) -> tuple[float, float]:
-    """Relative pose error over `step` poses: RMSE of translation (m) and rotation (rad)."""
+    """Relative pose error over `step` poses: RMSE of translation (m) and rotation (rad).
+
+    Args:
+        poses_true: [n, 4, 4], n > step.
+        poses_estimated: [n, 4, 4] of the same times, in a frame of their own.
+        step: number of poses from one to the other.
+    """
     true, estimated = np.asarray(poses_true), np.asarray(poses_estimated)
     d_true = se3.inverse(true[:-step]) @ true[step:]
     d_estimated = se3.inverse(estimated[:-step]) @ estimated[step:]

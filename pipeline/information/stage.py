@@ -168,7 +168,11 @@ class FrontEnd:
     others: list[Odometry]
 
     def between(self, most: int) -> list[Odometry]:
-        """At most so many of the other frames, evenly spread."""
+        """At most so many of the other frames, evenly spread.
+
+        Args:
+            most: largest number of frames.
+        """
         total = len(self.others)
         return [self.others[k] for k in evenly_spaced(total, min(most, total))]
 
@@ -181,6 +185,9 @@ def _depth_views(log: RgbdLog, frames: Sequence[Odometry], free: FreeSpace) -> I
 
 def read_frontend(path: Path) -> FrontEnd:
     """What the log of a front end has of its end.
+
+    Args:
+        path: of the log.
 
     Raises:
         DuagError: no map, or a keyframe whose frame is held out for evaluation.

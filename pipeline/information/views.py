@@ -43,7 +43,13 @@ class MapViews:
         return Rasterizer(threads=self.threads)
 
     def draw(self, rasterizer: Rasterizer, image: PosedRgbd, mask: NDArray[np.bool_] | None) -> Render:
-        """The map as the camera of an image sees it, where the mask allows."""
+        """The map as the camera of an image sees it, where the mask allows.
+
+        Args:
+            rasterizer: draws.
+            image: with its pose, of the same camera.
+            mask: bool [h, w], pixels that are drawn; None: all.
+        """
         T_camera_world = se3.inverse(image.T_world_camera)
         return rasterizer.forward(
             self.gaussians, self.camera, T_camera_world, mask=mask, depth_kind=self.depth_kind
@@ -51,7 +57,13 @@ class MapViews:
 
 
 def free_space(images: Sequence[PosedRgbd], camera: PinholeCamera, config: MovingConfig) -> FreeSpace:
-    """Space that the images saw to be free."""
+    """Space that the images saw to be free.
+
+    Args:
+        images: posed in one frame; their usable depth counts.
+        camera: of the images.
+        config: how free space is found.
+    """
     free = FreeSpace(camera, config)
     for image in images:
         free.add(image.usable_depth, image.T_world_camera)
@@ -59,7 +71,12 @@ def free_space(images: Sequence[PosedRgbd], camera: PinholeCamera, config: Movin
 
 
 def without_moving(images: Sequence[PosedRgbd], free: FreeSpace) -> ShelvedList[PosedRgbd]:
-    """The images with what moved masked, as the front end did before it mapped them."""
+    """The images with what moved masked, as the front end did before it mapped them.
+
+    Args:
+        images: posed in the frame of `free`.
+        free: space that they saw to be free.
+    """
     return ShelvedList(
         replace(image, mask=free.usable(image.usable_depth, image.T_world_camera, image.mask))
         for image in images

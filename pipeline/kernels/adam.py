@@ -21,11 +21,27 @@ class CompiledAdam(Adam):
     """`splat.optimizer.Adam` on all cores asked for; the same bits as that, for any number of threads."""
 
     def __init__(self, n: int = 0, isa: str = "auto", threads: SupportsIndex = 1) -> None:
+        """Begin with Gaussians that were never optimized.
+
+        Args:
+            n: number of Gaussians.
+            isa: instruction set, one of `available_isas()`; "auto" takes the fastest of this machine.
+            threads: of every step, 1 or more; changes no bit of any result.
+        """
         super().__init__(n)
         self.isa, self.threads = isa, threads
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
-        """The Gaussians after one step; those without any gradient of color or opacity are untouched."""
+        """The Gaussians after one step; those without any gradient of color or opacity are untouched.
+
+        Args:
+            gaussians: n, as many as the optimizer has; left as they are.
+            gradients: derivatives of the loss by their parameters, float32.
+            rates: step lengths.
+
+        Raises:
+            ValueError: an array of a wrong type or shape; the message names it.
+        """
         out = gaussians.copy()
         nowhere = np.array([-np.inf], np.float32)
         self.step_in_place(out, gradients, rates, least=nowhere, limits=(np.inf, np.inf))

@@ -43,13 +43,26 @@ class KernelStatus(IntEnum):
 
 
 def check_wanted(pose: bool, parameters: bool, fisher: bool) -> None:
-    """Refuse derivatives that exclude each other."""
+    """Refuse derivatives that exclude each other.
+
+    Args:
+        pose: whether the derivative by the pose is wanted.
+        parameters: whether those by the parameters of the Gaussians are.
+        fisher: whether the diagonal of the information is.
+
+    Raises:
+        ValueError: without parameters, there is no pose, or the diagonal is wanted.
+    """
     if not parameters and (fisher or not pose):
         raise ValueError("parameters is False, expected pose=True and fisher=False with it")
 
 
 def arrays_of(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
-    """The parameters in the order in which the kernels take them."""
+    """The parameters in the order in which the kernels take them.
+
+    Args:
+        gaussians: n Gaussians.
+    """
     return (
         gaussians.means,
         gaussians.quats_wxyz,
@@ -60,13 +73,29 @@ def arrays_of(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
 
 
 def check_type(name: str, value: object, expected: type) -> None:
-    """Refuse a value of another type."""
+    """Refuse a value of another type.
+
+    Args:
+        name: of the argument.
+        value: of the argument.
+        expected: its type.
+
+    Raises:
+        ValueError: it has another type.
+    """
     if not isinstance(value, expected):
         raise ValueError(f"{name} is {type(value).__name__}, expected {expected.__name__}")
 
 
 def checked_camera(camera: PinholeCamera) -> tuple[int, int, NDArray[np.float32]]:
-    """Height, width and (fx, fy, cx, cy) of a camera."""
+    """Height, width and (fx, fy, cx, cy) of a camera.
+
+    Args:
+        camera: pinhole camera, in pixels.
+
+    Raises:
+        ValueError: no camera, or a size, focal length or center out of range.
+    """
     check_type("camera", camera, PinholeCamera)
     for name in ("width", "height"):
         side = getattr(camera, name)
@@ -98,7 +127,15 @@ def _real_numbers(name: str, value: ArrayLike, expected: str) -> NDArray[np.floa
 
 
 def checked_pose(name: str, T: ArrayLike) -> NDArray[np.float32]:
-    """A rigid motion [4, 4] in the precision of the kernels."""
+    """A rigid motion [4, 4] in the precision of the kernels.
+
+    Args:
+        name: of the argument.
+        T: [4, 4].
+
+    Raises:
+        ValueError: not [4, 4], not finite, or no rigid motion.
+    """
     pose = _real_numbers(name, T, "an array of numbers")
     if pose.shape != (4, 4):
         raise ValueError(f"{name} has shape {pose.shape}, expected (4, 4)")
@@ -115,7 +152,14 @@ def checked_pose(name: str, T: ArrayLike) -> NDArray[np.float32]:
 
 
 def checked_background(background: ArrayLike) -> NDArray[np.float32]:
-    """RGB [3]."""
+    """RGB [3].
+
+    Args:
+        background: RGB, three numbers.
+
+    Raises:
+        ValueError: other than three numbers within +-1e9.
+    """
     expected = "three numbers within +-1e9"
     color = _real_numbers("background", background, expected)
     if color.shape != (3,) or not (np.abs(color) <= 1e9).all():
@@ -124,7 +168,15 @@ def checked_background(background: ArrayLike) -> NDArray[np.float32]:
 
 
 def checked_mask(mask: object, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """A mask [H, W] as bytes."""
+    """A mask [H, W] as bytes.
+
+    Args:
+        mask: bool [H, W].
+        shape: (H, W), size of the camera in pixels.
+
+    Raises:
+        ValueError: no array of bool, or of another shape.
+    """
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
         found = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
         raise ValueError(f"mask is {found}, expected an array of bool")
@@ -134,7 +186,14 @@ def checked_mask(mask: object, shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def checked_exposure(exposure: tuple[float, float]) -> tuple[float, float]:
-    """Gain and offset of an exposure (a, b)."""
+    """Gain and offset of an exposure (a, b).
+
+    Args:
+        exposure: (a, b), log gain and offset.
+
+    Raises:
+        ValueError: other than two numbers within +-80 and +-1e9.
+    """
     expected = "two numbers within +-80 and +-1e9"
     pair = _real_numbers("exposure", exposure, expected)
     if pair.shape != (2,) or not (np.abs(pair) <= (80.0, 1e9)).all():
@@ -143,13 +202,31 @@ def checked_exposure(exposure: tuple[float, float]) -> tuple[float, float]:
 
 
 def check_share(name: str, value: object) -> None:
-    """Refuse what is no number from 0 to 0.5."""
+    """Refuse what is no number from 0 to 0.5.
+
+    Args:
+        name: of the argument.
+        value: of the argument.
+
+    Raises:
+        ValueError: it is none.
+    """
     if not (isinstance(value, Real) and 0 <= float(value) <= 0.5):
         raise ValueError(f"{name} is {value!r}, expected a number from 0 to 0.5")
 
 
 def check_array(name: str, array: object, shape: tuple[int, ...], dtype: type) -> None:
-    """Refuse what the kernels cannot add to in place."""
+    """Refuse what the kernels cannot add to in place.
+
+    Args:
+        name: of the argument.
+        array: of the argument.
+        shape: expected.
+        dtype: expected.
+
+    Raises:
+        ValueError: another type or shape, not contiguous, or not writeable.
+    """
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
         raise ValueError(f"{name} is {found}, expected an array of {np.dtype(dtype)}")
@@ -276,7 +353,11 @@ def refuse_bad_image(status: int, faults: dict[str, str]) -> None:
 
 
 def complaint_about(gaussians: Gaussians) -> str:
-    """Why a kernel refused these Gaussians."""
+    """Why a kernel refused these Gaussians.
+
+    Args:
+        gaussians: one at least, refused.
+    """
     names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
     for name, array in zip(names, arrays_of(gaussians), strict=True):
         bad = np.flatnonzero(~np.isfinite(array.reshape(len(gaussians), -1)).all(axis=1))

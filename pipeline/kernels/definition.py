@@ -165,7 +165,14 @@ def slope_limit(pixels: int, focal_px: float, center_px: float) -> float:
 
 
 def linearized(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
-    """J W [k, 2, 3] of places [k, 3] in the camera, and how far [k], relatively, they are from where J is clamped."""
+    """J W [k, 2, 3] of places in the camera, px/m, and how far [k], relatively, they are from where J is
+    clamped.
+
+    Args:
+        places: [k, 3] with z > 0, meters, camera frame.
+        W: rotation [3, 3] of T_camera_map, or [k, 3, 3].
+        camera: that sees them.
+    """
     import torch
 
     x, y, z = places.unbind(-1)
@@ -184,7 +191,14 @@ def linearized(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
 
 
 def paint(pixels: Any, screen: Screen, background: Any, closing: float = 0.0) -> Painting:
-    """Color, depth and alpha of pixels [m, 2]; `closing`: see `blend`."""
+    """Color, depth and alpha of pixels.
+
+    Args:
+        pixels: [m, 2], column and row.
+        screen: k Gaussians, nearest first.
+        background: RGB [3].
+        closing: as in `blend`.
+    """
     weights, gates = blend(pixels, screen.centers, screen.conics, screen.opacities, closing=closing)
     total = weights.sum(-1)
     color = (weights[..., None] * screen.colors).sum(-2) + (1 - total)[:, None] * background
@@ -257,7 +271,12 @@ def view_loss(
 
 
 def sigma_of(quats_wxyz: Any, log_scales: Any) -> Any:
-    """Sigma [n, 3, 3] of quaternions of any length and log-scales."""
+    """Sigma [n, 3, 3] of quaternions of any length and log-scales.
+
+    Args:
+        quats_wxyz: [n, 4].
+        log_scales: [n, 3], logarithms of meters.
+    """
     import torch
 
     w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=-1, keepdim=True)).unbind(-1)
@@ -273,7 +292,11 @@ def sigma_of(quats_wxyz: Any, log_scales: Any) -> Any:
 
 
 def matrix_exp(vec_log: Any) -> Any:
-    """Sigma [n, 3, 3] of vec log Sigma [n, 6]."""
+    """Sigma [n, 3, 3] of vec log Sigma [n, 6].
+
+    Args:
+        vec_log: [n, 6], order of `geometry.spd`.
+    """
     import torch
 
     basis = torch.tensor(spd.vec_to_sym(np.eye(6)))
@@ -281,7 +304,11 @@ def matrix_exp(vec_log: Any) -> Any:
 
 
 def hat(w: Any) -> Any:
-    """Cross product matrices [n, 3, 3] of w [n, 3]."""
+    """Cross product matrices [n, 3, 3] of w [n, 3].
+
+    Args:
+        w: [n, 3].
+    """
     import torch
 
     x, y, z = w.unbind(-1)
@@ -297,7 +324,11 @@ def _huber(residual: Any, delta: float) -> Any:
 
 
 def color_and_depth(drawn: Painting) -> Any:
-    """The measured channels [4, m]: red, green, blue, depth."""
+    """The measured channels [4, m]: red, green, blue, depth.
+
+    Args:
+        drawn: m pixels.
+    """
     import torch
 
     return torch.cat([drawn.color.T, drawn.depth[None]])
@@ -325,11 +356,21 @@ def derivatives_by_inputs(screen: Screen, inputs: list[Any], order: NDArray[np.i
 
 
 def columns_of(values: Any, axes: int) -> Any:
-    """All axes but the first few as one."""
+    """All axes but the first few as one.
+
+    Args:
+        values: [...], of more axes than `axes`, or as many.
+        axes: number of axes that stay.
+    """
     return values.reshape(*values.shape[:axes], int(np.prod(values.shape[axes:])))
 
 
 def tensor(array: ArrayLike) -> Any:
+    """An array in float64, without a gradient.
+
+    Args:
+        array: of numbers.
+    """
     import torch
 
     return torch.tensor(np.asarray(array, dtype=np.float64))

@@ -16,19 +16,32 @@ NOTHING = np.zeros(0, dtype=np.float32)  # an optional array that is not given
 
 
 def empty(*shape: int) -> NDArray[np.float32]:
-    """An array in memory that earlier outputs gave back, holding anything."""
+    """An array in memory that earlier outputs gave back, holding anything.
+
+    Args:
+        *shape: of the array.
+    """
     return _raster.empty(int(np.prod(shape))).reshape(shape)
 
 
 def zeros(*shape: int) -> NDArray[np.float32]:
-    """The same, holding zeros."""
+    """The same, holding zeros.
+
+    Args:
+        *shape: of the array.
+    """
     array = empty(*shape)
     array.fill(0.0)
     return array
 
 
 def outputs_for(gaussians: Gaussians, parameters: bool) -> list[NDArray[np.float32]]:
-    """Where the derivatives by the parameters go; arrays without elements if they are not wanted."""
+    """Where the derivatives by the parameters go; arrays without elements if they are not wanted.
+
+    Args:
+        gaussians: by whose parameters is differentiated.
+        parameters: whether these derivatives are wanted.
+    """
     return [zeros(*array.shape) if parameters else NOTHING for array in arrays_of(gaussians)]
 
 

@@ -59,7 +59,16 @@ class ReferenceRasterizer:
         depth_kind: DepthKind = "blended",
         mask: NDArray[np.bool_] | None = None,
     ) -> Render:
-        """Draw the Gaussians (frame map) into the camera at T_camera_map [4, 4]; see `Rasterizer.forward`."""
+        """Draw the Gaussians into the camera; see `Rasterizer.forward`.
+
+        Args:
+            gaussians: n Gaussians in the frame `map`.
+            camera: that draws.
+            T_camera_map: [4, 4].
+            background: RGB 0..1.
+            depth_kind: depth of a Gaussian at a pixel.
+            mask: bool [H, W], pixels that are drawn; None: all.
+        """
         import torch
 
         if depth_kind not in DEPTH_KINDS:
@@ -151,7 +160,12 @@ class ReferenceRasterizer:
             sums.diagonal += np.diagonal(full, axis1=1, axis2=2)
 
     def full_fisher(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike) -> NDArray[np.float64]:
-        """J^T R^-1 J [n, 14, 14] of the last view; see `Rasterizer.full_fisher`."""
+        """J^T R^-1 J [n, 14, 14] of the last view; see `Rasterizer.full_fisher`.
+
+        Args:
+            inv_var_color: [H, W], 1/sigma^2 of every color channel.
+            inv_var_depth: [H, W], 1/m^2.
+        """
         jacobian = self._jacobian(color_and_depth, self._screen, list(self._parameters.values()))
         precision = self._precision(inv_var_color, inv_var_depth)
         return np.einsum("cm,cmni,cmnj->nij", precision, jacobian, jacobian)
@@ -227,6 +241,11 @@ class ReferenceRasterizer:
 
         They are sums over pixels of sums over screen numbers. Where these cancel, rounding leaves an error in
         proportion to this.
+
+        Args:
+            d_color: dL/dcolor [H, W, 3].
+            d_depth: dL/ddepth [H, W]; None is zero.
+            d_alpha: dL/dalpha [H, W]; None is zero.
         """
         terms = self._terms(self._dot(d_color, d_depth, d_alpha)).sum((0, 1))
         return terms[:, :14], terms[:, 14:].sum(axis=0)
@@ -234,11 +253,22 @@ class ReferenceRasterizer:
     def empirical_terms(
         self, d_color: ArrayLike, d_depth: ArrayLike | None = None, d_alpha: ArrayLike | None = None
     ) -> NDArray[np.float64]:
-        """The same of `fisher_diagonal` [n, 14], whose squares are those of sums over screen numbers."""
+        """The same of `fisher_diagonal` [n, 14], whose squares are those of sums over screen numbers.
+
+        Args:
+            d_color: as in `gradient_terms`.
+            d_depth: as in `gradient_terms`.
+            d_alpha: as in `gradient_terms`.
+        """
         return (self._terms(self._dot(d_color, d_depth, d_alpha))[..., :14] ** 2).sum((0, 1))
 
     def information_terms(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike) -> NDArray[np.float64]:
-        """The same of the diagonal that `fisher` adds up."""
+        """The same of the diagonal that `fisher` adds up.
+
+        Args:
+            inv_var_color: as in `full_fisher`.
+            inv_var_depth: as in `full_fisher`.
+        """
         precision = self._precision(inv_var_color, inv_var_depth)
         return np.einsum("cm,cmni->ni", precision, self._terms(color_and_depth)[..., :14] ** 2)
 

@@ -90,6 +90,12 @@ class FisherSums:
     """
 
     def __init__(self, n: int, diagonal: bool = False) -> None:
+        """Begin with zeros.
+
+        Args:
+            n: number of Gaussians.
+            diagonal: also sum `diagonal`.
+        """
         self.geometry = np.zeros((n, GEOMETRY_SIZE))
         self.color = np.zeros((n, 3))
         self.opacity = np.zeros(n)

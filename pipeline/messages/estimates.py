@@ -84,7 +84,11 @@ class Odometry:
 
     @staticmethod
     def unpack(m: Any) -> Odometry:
-        """From duagc.v1.Odometry."""
+        """From duagc.v1.Odometry.
+
+        Args:
+            m: the protobuf message.
+        """
         if m.status not in _STATUS_NAME:
             raise DuagError(f"Odometry.status is {m.status}, expected one of {sorted(_STATUS_NAME)}")
         return Odometry(
@@ -146,7 +150,11 @@ class Keyframe:
 
     @staticmethod
     def unpack(m: Any) -> Keyframe:
-        """From duagc.v1.Keyframe."""
+        """From duagc.v1.Keyframe.
+
+        Args:
+            m: the protobuf message.
+        """
         return Keyframe(
             stamp_ns=unpack_stamp(m),
             robot=m.robot,
@@ -198,7 +206,11 @@ class Submap:
 
     @staticmethod
     def unpack(m: Any) -> Submap:
-        """From duagc.v1.Submap."""
+        """From duagc.v1.Submap.
+
+        Args:
+            m: the protobuf message.
+        """
         counts = (m.submap, m.first_frame, m.last_frame, m.frames, m.keyframes, m.loop_closures)
         return Submap(unpack_stamp(m), m.robot, *counts)
 
@@ -239,7 +251,11 @@ class KeyframeFactor:
 
     @staticmethod
     def unpack(m: Any) -> KeyframeFactor:
-        """From duagc.v1.KeyframeFactor."""
+        """From duagc.v1.KeyframeFactor.
+
+        Args:
+            m: the protobuf message.
+        """
         return KeyframeFactor(
             stamp_ns=unpack_stamp(m),
             robot=m.robot,
@@ -286,6 +302,9 @@ class FrameExposure:
     @staticmethod
     def unpack(m: Any) -> FrameExposure:
         """From duagc.v1.FrameExposure.
+
+        Args:
+            m: the protobuf message.
 
         Raises:
             DuagError: a gain that is not positive.
@@ -335,7 +354,11 @@ class CorrectedKeyframes:
 
     @staticmethod
     def unpack(m: Any) -> CorrectedKeyframes:
-        """From duagc.v1.CorrectedKeyframes."""
+        """From duagc.v1.CorrectedKeyframes.
+
+        Args:
+            m: the protobuf message.
+        """
         field = "CorrectedKeyframes.poses_world_keyframe_float64"
         rows = unpack_array(m.poses_world_keyframe_float64, "float64", (m.count, 3, 4), field)
         poses = np.tile(np.eye(4), (m.count, 1, 1))
@@ -366,6 +389,10 @@ _UNPACK: dict[str, Callable[[Any], Any]] = {
 
 
 def unpack(message: Any) -> Any:
-    """The dataclass of a protobuf message that has one here; any other message as it is."""
+    """The dataclass of a protobuf message that has one here; any other message as it is.
+
+    Args:
+        message: of any schema.
+    """
     function = _UNPACK.get(message.DESCRIPTOR.full_name)
     return message if function is None else function(message)

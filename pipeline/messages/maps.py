@@ -54,7 +54,11 @@ class MapUpdate:
 
     @staticmethod
     def unpack(m: Any) -> MapUpdate:
-        """From duagc.v1.MapUpdate."""
+        """From duagc.v1.MapUpdate.
+
+        Args:
+            m: the protobuf message.
+        """
         return MapUpdate(
             stamp_ns=unpack_stamp(m),
             robot=m.robot,
@@ -87,7 +91,14 @@ def _pack_gaussians(gaussians: Gaussians, m: Any) -> None:
 
 
 def unpack_gaussians(m: Any) -> Gaussians:
-    """Gaussians of a duagc.v1.GaussianArrays."""
+    """Gaussians of a duagc.v1.GaussianArrays.
+
+    Args:
+        m: the protobuf message.
+
+    Raises:
+        DuagError: an array of another length than the number of Gaussians asks for.
+    """
     return Gaussians(
         **{
             name: unpack_array(getattr(m, field), dtype, (m.count, *tail), f"GaussianArrays.{field}")
@@ -174,7 +185,14 @@ class GaussianInformation:
 
     @staticmethod
     def unpack(m: Any) -> GaussianInformation:
-        """From duagc.v1.GaussianInformation."""
+        """From duagc.v1.GaussianInformation.
+
+        Args:
+            m: the protobuf message.
+
+        Raises:
+            DuagError: an array of another length than the number of Gaussians asks for.
+        """
 
         def array(field: str, dtype: str, *tail: int) -> NDArray[Any]:
             return unpack_array(getattr(m, field), dtype, (m.count, *tail), f"GaussianInformation.{field}")
@@ -227,7 +245,15 @@ class GaussianMap:
 
     @staticmethod
     def unpack(m: Any) -> GaussianMap:
-        """From duagc.v1.GaussianMap."""
+        """From duagc.v1.GaussianMap.
+
+        Args:
+            m: the protobuf message.
+
+        Raises:
+            DuagError: an array of another length than the number of Gaussians asks for, or an unknown kind of
+                depth.
+        """
         return GaussianMap(
             stamp_ns=unpack_stamp(m),
             robot=m.robot,

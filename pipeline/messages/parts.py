@@ -17,27 +17,50 @@ WORLD_FRAME = "world"
 
 
 def map_frame(robot: str) -> str:
-    """Name of the frame of a robot's own map: that of its first camera pose."""
+    """Name of the frame of a robot's own map: that of its first camera pose.
+
+    Args:
+        robot: name of the robot, or of a component.
+    """
     return f"{robot}/map"
 
 
 def camera_frame(robot: str) -> str:
-    """Name of the frame of a robot's color camera: x right, y down, z forward."""
+    """Name of the frame of a robot's color camera: x right, y down, z forward.
+
+    Args:
+        robot: name of the robot, or of a component.
+    """
     return f"{robot}/camera"
 
 
 def pack_stamp(message: Any, stamp_ns: int) -> None:
-    """Set the field `timestamp` of any message to integer nanoseconds."""
+    """Set the field `timestamp` of any message to integer nanoseconds.
+
+    Args:
+        message: with a field `timestamp`; changed in place.
+        stamp_ns: time, ns.
+    """
     message.timestamp.seconds, message.timestamp.nanos = divmod(int(stamp_ns), NANOSECONDS)
 
 
 def unpack_stamp(message: Any) -> int:
-    """Integer nanoseconds of the field `timestamp` of any message."""
+    """Integer nanoseconds of the field `timestamp` of any message.
+
+    Args:
+        message: with a field `timestamp`.
+    """
     return message.timestamp.seconds * NANOSECONDS + message.timestamp.nanos
 
 
 def unpack_array(data: bytes, dtype: str, shape: tuple[int, ...], field: str) -> NDArray[Any]:
     """Array of a shape from little-endian bytes; a writable copy.
+
+    Args:
+        data: little-endian bytes, row-major.
+        dtype: name of the type, without its byte order.
+        shape: of the array.
+        field: name of the field, for the line of the error.
 
     Raises:
         DuagError: the bytes do not have the length that the shape asks for.
@@ -51,6 +74,11 @@ def unpack_array(data: bytes, dtype: str, shape: tuple[int, ...], field: str) ->
 def numbers(values: Any, shape: tuple[int, ...], field: str) -> Array:
     """float64 array of a shape from a repeated field.
 
+    Args:
+        values: of the repeated field, row-major.
+        shape: of the array.
+        field: name of the field, for the line of the error.
+
     Raises:
         DuagError: another number of values than the shape asks for.
     """
@@ -61,7 +89,14 @@ def numbers(values: Any, shape: tuple[int, ...], field: str) -> Array:
 
 
 def pack_pose(T: ArrayLike) -> Any:
-    """duagc.v1.Pose of a motion [4, 4]."""
+    """duagc.v1.Pose of a motion.
+
+    Args:
+        T: [4, 4], translation in meters.
+
+    Raises:
+        ValueError: not [4, 4].
+    """
     T = np.asarray(T, dtype=np.float64)
     if T.shape != (4, 4):
         raise ValueError(f"a pose is [4, 4], not {T.shape}")
@@ -70,7 +105,15 @@ def pack_pose(T: ArrayLike) -> Any:
 
 
 def unpack_pose(pose: Any, field: str = "pose") -> Array:
-    """Motion [4, 4] of a duagc.v1.Pose."""
+    """Motion [4, 4] of a duagc.v1.Pose.
+
+    Args:
+        pose: duagc.v1.Pose.
+        field: name of the field, for the line of the error.
+
+    Raises:
+        DuagError: a rotation of other than nine numbers.
+    """
     T = np.eye(4)
     T[:3, :3] = numbers(pose.rotation, (3, 3), f"{field}.rotation")
     T[:3, 3] = pose.translation.x, pose.translation.y, pose.translation.z
@@ -78,7 +121,14 @@ def unpack_pose(pose: Any, field: str = "pose") -> Array:
 
 
 def pack_information(information: ArrayLike) -> list[float]:
-    """The 36 numbers of the information [6, 6] of a pose."""
+    """The 36 numbers of the information of a pose, row by row.
+
+    Args:
+        information: [6, 6], right tangent (translation m, rotation rad).
+
+    Raises:
+        ValueError: not [6, 6].
+    """
     array = np.asarray(information, dtype=np.float64)
     if array.shape != (6, 6):
         raise ValueError(f"the information of a pose is [6, 6], not {array.shape}")

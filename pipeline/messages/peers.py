@@ -59,7 +59,11 @@ class PeerMapReport:
 
     @staticmethod
     def unpack(m: Any) -> PeerMapReport:
-        """From duagc.v1.PeerMapReport."""
+        """From duagc.v1.PeerMapReport.
+
+        Args:
+            m: the protobuf message.
+        """
         return PeerMapReport(stamp_ns=unpack_stamp(m), **{name: getattr(m, name) for name in _reported()})
 
 
@@ -103,7 +107,14 @@ class RejectedMatches:
 
     @staticmethod
     def unpack(m: Any) -> RejectedMatches:
-        """From duagc.v1.RejectedMatches."""
+        """From duagc.v1.RejectedMatches.
+
+        Args:
+            m: the protobuf message.
+
+        Raises:
+            DuagError: an array of another length than the number of matches asks for.
+        """
         ids = unpack_array(m.ids_int64, "int64", (m.count, 2), "RejectedMatches.ids")
         return RejectedMatches(unpack_stamp(m), m.robot, m.lower, m.higher, ids)
 
@@ -151,7 +162,14 @@ class PeerColors:
 
     @staticmethod
     def unpack(m: Any) -> PeerColors:
-        """From duagc.v1.PeerColors."""
+        """From duagc.v1.PeerColors.
+
+        Args:
+            m: the protobuf message.
+
+        Raises:
+            DuagError: a gain, offset or deviation of other than three numbers.
+        """
 
         def channels(field: str) -> Array:
             return numbers(getattr(m, field), (3,), f"PeerColors.{field}")

@@ -26,12 +26,28 @@ def _foxglove(name: str, stamp_ns: int, frame_id: str, **fields: Any) -> Any:
 
 
 def pack_color(stamp_ns: int, robot: str, data: bytes, image_format: str) -> Any:
-    """foxglove.CompressedImage of encoded bytes; `image_format` is "jpeg" or "png"."""
+    """foxglove.CompressedImage of encoded bytes.
+
+    Args:
+        stamp_ns: time of the image, ns.
+        robot: whose color camera took it.
+        data: encoded image.
+        image_format: "jpeg" or "png".
+    """
     return _foxglove("CompressedImage", stamp_ns, camera_frame(robot), data=data, format=image_format)
 
 
 def pack_depth(stamp_ns: int, robot: str, depth: NDArray[np.uint16]) -> Any:
-    """foxglove.RawImage, 16UC1 little-endian, of depth in units of the channel's depth_scale, uint16 [H, W]."""
+    """foxglove.RawImage, 16UC1 little-endian, of a depth image.
+
+    Args:
+        stamp_ns: time of the image, ns.
+        robot: in whose color camera it is.
+        depth: uint16 [H, W], in units of the channel's depth_scale, 0 = unknown.
+
+    Raises:
+        ValueError: another type or number of axes.
+    """
     if depth.dtype != np.uint16 or depth.ndim != 2:
         raise ValueError(f"depth is {depth.dtype} {depth.shape}, expected uint16 [H, W]")
     height, width = depth.shape
@@ -41,7 +57,15 @@ def pack_depth(stamp_ns: int, robot: str, depth: NDArray[np.uint16]) -> Any:
 
 
 def unpack_depth(m: Any, where: str) -> NDArray[np.uint16]:
-    """uint16 [H, W] of a foxglove.RawImage; `where` begins the line of an error."""
+    """uint16 [H, W] of a foxglove.RawImage.
+
+    Args:
+        m: the protobuf message.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: another encoding, or a number of bytes that does not fit the size.
+    """
     if m.encoding != "16UC1":
         raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 16UC1")
     if m.step < 2 * m.width or m.step % 2 or m.height * m.width == 0:
@@ -52,7 +76,16 @@ def unpack_depth(m: Any, where: str) -> NDArray[np.uint16]:
 
 
 def pack_mask(stamp_ns: int, robot: str, usable: NDArray[np.bool_]) -> Any:
-    """foxglove.RawImage, 8UC1, of the pixels that may be used, bool [H, W]: 255 = yes, 0 = no."""
+    """foxglove.RawImage, 8UC1, of the pixels that may be used: 255 = yes, 0 = no.
+
+    Args:
+        stamp_ns: time of the image, ns.
+        robot: in whose color camera it is.
+        usable: bool [H, W].
+
+    Raises:
+        ValueError: another type or number of axes.
+    """
     if usable.dtype != np.bool_ or usable.ndim != 2:
         raise ValueError(f"mask is {usable.dtype} {usable.shape}, expected bool [H, W]")
     height, width = usable.shape
@@ -62,7 +95,16 @@ def pack_mask(stamp_ns: int, robot: str, usable: NDArray[np.bool_]) -> Any:
 
 
 def unpack_mask(m: Any, where: str) -> NDArray[np.bool_]:
-    """bool [H, W], True = usable, of a foxglove.RawImage; `where` begins the line of an error."""
+    """bool [H, W], True = usable, of a foxglove.RawImage.
+
+    Args:
+        m: the protobuf message.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: another encoding, a number of bytes that does not fit the size, or values other than 0 and
+            255.
+    """
     if m.encoding != "8UC1":
         raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 8UC1")
     if m.step < m.width or m.height * m.width == 0:
@@ -77,7 +119,16 @@ def unpack_mask(m: Any, where: str) -> NDArray[np.bool_]:
 
 
 def pack_valid(stamp_ns: int, robot: str, valid: NDArray[np.bool_]) -> Any:
-    """foxglove.CompressedImage, PNG of 8 bits, of the pixels that show the scene, bool [H, W]: 255 = yes, 0 = no."""
+    """foxglove.CompressedImage, PNG of 8 bits, of the pixels that show the scene: 255 = yes, 0 = no.
+
+    Args:
+        stamp_ns: time of the image, ns.
+        robot: in whose color camera it is.
+        valid: bool [H, W].
+
+    Raises:
+        ValueError: another type or number of axes.
+    """
 
     if valid.dtype != np.bool_ or valid.ndim != 2:
         raise ValueError(f"mask is {valid.dtype} {valid.shape}, expected bool [H, W]")
@@ -86,7 +137,15 @@ def pack_valid(stamp_ns: int, robot: str, valid: NDArray[np.bool_]) -> Any:
 
 
 def unpack_valid(m: Any, where: str) -> NDArray[np.bool_]:
-    """bool [H, W], True = shows the scene, of a foxglove.CompressedImage; `where` begins the line of an error."""
+    """bool [H, W], True = shows the scene, of a foxglove.CompressedImage.
+
+    Args:
+        m: the protobuf message.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: no PNG of 8 bits and one channel, or values other than 0 and 255.
+    """
     import cv2
 
     image = decode_image(m.data, cv2.IMREAD_UNCHANGED)
@@ -134,6 +193,9 @@ def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera, lens: Len
 def unpack_calibration(m: Any) -> PinholeCamera:
     """Camera of a foxglove.CameraCalibration whose images have no distortion.
 
+    Args:
+        m: the protobuf message.
+
     Raises:
         DuagError: lens distortion, numbers that are not finite, or no image size.
     """
@@ -147,6 +209,9 @@ def unpack_calibration(m: Any) -> PinholeCamera:
 
 def unpack_camera(m: Any) -> tuple[PinholeCamera, Lens | None]:
     """The pinhole camera of a foxglove.CameraCalibration, and the lens of its images.
+
+    Args:
+        m: the protobuf message.
 
     Returns:
         The camera by whose pixels images are read, and how they were taken; None: by this camera.
@@ -189,7 +254,14 @@ def _pinhole(m: Any, K: Array, name: str) -> PinholeCamera:
 
 
 def pack_transform(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -> Any:
-    """foxglove.FrameTransform of a motion [4, 4] that takes coordinates of frame `child` to frame `parent`."""
+    """foxglove.FrameTransform of a motion that takes coordinates of frame `child` to frame `parent`.
+
+    Args:
+        stamp_ns: time, ns.
+        parent: name of the frame.
+        child: name of the frame.
+        T_parent_child: [4, 4], translation in meters.
+    """
     T = np.asarray(T_parent_child, dtype=np.float64)
     w, x, y, z = so3.to_quat_wxyz(T[:3, :3]).tolist()
     tx, ty, tz = T[:3, 3].tolist()
@@ -206,6 +278,9 @@ def pack_transform(stamp_ns: int, parent: str, child: str, T_parent_child: Array
 def unpack_transform(m: Any) -> Array:
     """Motion T_parent_child [4, 4] of a foxglove.FrameTransform.
 
+    Args:
+        m: the protobuf message.
+
     Raises:
         DuagError: numbers that are not finite, or a quaternion of no length.
     """
@@ -216,7 +291,13 @@ _NUMBER_TYPES = {7: "float32", 8: "float64"}  # foxglove.PackedElementField.Nume
 
 
 def pack_points(stamp_ns: int, frame_id: str, points_m: ArrayLike) -> Any:
-    """foxglove.PointCloud of points [n, 3], float32 meters."""
+    """foxglove.PointCloud of points, in float32.
+
+    Args:
+        stamp_ns: time, ns.
+        frame_id: frame of the points.
+        points_m: [n, 3], meters.
+    """
     fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
     data = array_bytes(points_m, "float32")
     pose = {"orientation": {"w": 1.0}}
@@ -227,6 +308,13 @@ def unpack_points(m: Any, where: str) -> Array:
     """Points [n, 3] in meters, in the frame of the message, of a foxglove.PointCloud; not finite ones are left out.
 
     `where` begins the line of an error.
+
+    Args:
+        m: the protobuf message.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: no fields x, y, z of floating point, or a number of bytes that does not fit.
     """
     fields = {field.name: field for field in m.fields}
     missing = [name for name in "xyz" if name not in fields or fields[name].type not in _NUMBER_TYPES]
@@ -262,7 +350,14 @@ def _rigid(p: Any, q: Any, what: str) -> Array:
 
 
 def pack_imu(stamp_ns: int, robot: str, rates_rad_s: ArrayLike, accelerations_m_s2: ArrayLike) -> Any:
-    """duagc.v1.Imu of angular velocity [3] and linear acceleration [3] in the frame of the unit."""
+    """duagc.v1.Imu of angular velocity and linear acceleration in the frame of the unit.
+
+    Args:
+        stamp_ns: time, ns.
+        robot: whose unit it is.
+        rates_rad_s: [3], rad/s.
+        accelerations_m_s2: [3], m/s^2.
+    """
     message = schemas.new(
         "Imu",
         frame_id=f"{robot}/imu",
@@ -277,7 +372,13 @@ def pack_imu(stamp_ns: int, robot: str, rates_rad_s: ArrayLike, accelerations_m_
 
 
 def pack_pose_in_frame(stamp_ns: int, frame_id: str, T_frame_body: ArrayLike) -> Any:
-    """foxglove.PoseInFrame of a motion [4, 4]; its rotation is kept as a unit quaternion."""
+    """foxglove.PoseInFrame of a motion; its rotation is kept as a unit quaternion.
+
+    Args:
+        stamp_ns: time, ns.
+        frame_id: name of the frame.
+        T_frame_body: [4, 4], translation in meters.
+    """
     T = np.asarray(T_frame_body, dtype=np.float64)
     w, x, y, z = so3.to_quat_wxyz(T[:3, :3]).tolist()
     tx, ty, tz = T[:3, 3].tolist()
@@ -287,6 +388,9 @@ def pack_pose_in_frame(stamp_ns: int, frame_id: str, T_frame_body: ArrayLike) ->
 
 def unpack_pose_in_frame(m: Any) -> Array:
     """Motion T_frame_body [4, 4] of a foxglove.PoseInFrame.
+
+    Args:
+        m: the protobuf message.
 
     Raises:
         DuagError: numbers that are not finite, or a quaternion of no length.

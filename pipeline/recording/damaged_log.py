@@ -74,7 +74,13 @@ _KNOWN: dict[int, Any] = {
 
 
 def records_of(stream: IO[bytes], size: int, salvage: Salvage) -> Iterator[Any]:
-    """Every schema, channel, message, metadata and attachment of a file that is certain."""
+    """Every schema, channel, message, metadata and attachment of a file that is certain.
+
+    Args:
+        stream: seekable, of the file.
+        size: of the file, bytes.
+        salvage: gets a line for each damage found, and whether the file is cut.
+    """
     stream.seek(0)
     at = len(MAGIC) if stream.read(len(MAGIC)) == MAGIC else 0
     if at == 0:

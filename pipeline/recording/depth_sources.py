@@ -48,12 +48,28 @@ class DepthSource(Protocol):
     scale: float
 
     def read(self, record: Record) -> DepthImage:
-        """The depth image of a message."""
+        """The depth image of a message.
+
+        Args:
+            record: of the source's topic.
+
+        Raises:
+            DuagError: the message cannot be read, or does not have the size of its calibration.
+        """
         ...
 
 
 def depth_source(log: LogFile, robot: str, camera: PinholeCamera) -> DepthSource:
-    """The best source that the log has: registered depth, then another camera's, then a LiDAR's."""
+    """The best source that the log has: registered depth, then another camera's, then a LiDAR's.
+
+    Args:
+        log: of the robot.
+        robot: whose topics are read.
+        camera: the color camera, whose pixels the depth images have.
+
+    Raises:
+        DuagError: no source has a message, or what its images need to be understood is missing or changes.
+    """
     sources: tuple[tuple[topic_table.Topic, Callable[[LogFile, str, PinholeCamera], DepthSource]], ...] = (
         (topic_table.DEPTH, Registered),
         (topic_table.RAW_DEPTH, OtherCamera),
@@ -70,6 +86,16 @@ class Registered:
     """Depth images that are registered to color, and those of their standard deviation if there are any."""
 
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
+        """Read the scale, meters per unit, and how coarse the depth is.
+
+        Args:
+            log: of the robot.
+            robot: whose topics are read.
+            camera: the color camera.
+
+        Raises:
+            DuagError: the channel states no usable scale.
+        """
         self.topic, self.camera = topic_table.DEPTH.of(robot), camera
         self.scale = _meters(log, self.topic, DEPTH_SCALE_KEY)
         self._steps = _Steps(log, self.topic, self.scale, camera, robot=robot)
@@ -79,6 +105,15 @@ class Registered:
             self._sigma_scale = _meters(log, self._sigma_topic, DEPTH_SCALE_KEY)
 
     def read(self, record: Record) -> DepthImage:
+        """The depth image of a message, with its standard deviation if the log has it.
+
+        Args:
+            record: of the topic `depth`.
+
+        Raises:
+            DuagError: the message cannot be read, has another size, or lacks the image of its standard
+                deviation.
+        """
         depth_m = self._steps.smoothed(_depth_image(record, self.scale, self.camera))
         if not self._sigma_at:
             return DepthImage(depth_m)
@@ -96,6 +131,16 @@ class OtherCamera:
     """Depth images of a camera of its own, registered by its calibration and its pose in the color camera."""
 
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
+        """Read the scale, the calibration of the depth camera and its pose.
+
+        Args:
+            log: of the robot.
+            robot: whose topics are read.
+            camera: the color camera.
+
+        Raises:
+            DuagError: scale, calibration or pose is missing, cannot be read, or changes.
+        """
         self.topic, self.camera = topic_table.RAW_DEPTH.of(robot), camera
         self.scale = _meters(log, self.topic, DEPTH_SCALE_KEY)
         calibration = topic_table.RAW_DEPTH_CALIBRATION.of(robot)
@@ -105,6 +150,14 @@ class OtherCamera:
         self._steps = _Steps(log, self.topic, self.scale, self.depth_camera, robot=robot)
 
     def read(self, record: Record) -> DepthImage:
+        """The depth image of a message, moved into the color camera.
+
+        Args:
+            record: of the topic of the depth camera.
+
+        Raises:
+            DuagError: the message cannot be read, or has another size than the depth camera.
+        """
         depth_m = self._steps.smoothed(_depth_image(record, self.scale, self.depth_camera))
         return DepthImage(register_depth(depth_m, self.depth_camera, self.T_camera_depth, self.camera))
 
@@ -115,6 +168,16 @@ class Lidar:
     scale = 1.0
 
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
+        """Read the pose of the LiDAR and, if it is stated, the noise of its ranges.
+
+        Args:
+            log: of the robot.
+            robot: whose topics are read.
+            camera: the color camera.
+
+        Raises:
+            DuagError: the pose is missing, cannot be read, or changes; or the noise is no length.
+        """
         self.topic, self.camera = topic_table.LIDAR.of(robot), camera
         transform = topic_table.LIDAR_TRANSFORM.of(robot)
         self.T_camera_lidar = np.array(constant(log, transform, transform_rows))
@@ -122,6 +185,14 @@ class Lidar:
         self._range_sigma_m = _meters(log, self.topic, RANGE_SIGMA_KEY) if known else None
 
     def read(self, record: Record) -> DepthImage:
+        """The depth image of a sweep, filled between its points.
+
+        Args:
+            record: of the topic of the LiDAR.
+
+        Raises:
+            DuagError: the message cannot be read.
+        """
         points = messages.unpack_points(record.proto(), _where(record))
         range_sigma_m = self._range_sigma_m or 0.0
         depth_m, sigma_m = lidar_depth(points, self.T_camera_lidar, self.camera, range_sigma_m)
@@ -153,6 +224,11 @@ class _Steps:
 def constant(log: LogFile, topic: str, unpack: Callable[[Any], Value]) -> Value:
     """What every message of a topic says, which must be there and not change.
 
+    Args:
+        log: that is read.
+        topic: full name.
+        unpack: value of a protobuf message; values are compared with !=.
+
     Raises:
         DuagError: no message, one that cannot be read, or two that differ.
     """
@@ -172,7 +248,14 @@ def constant(log: LogFile, topic: str, unpack: Callable[[Any], Value]) -> Value:
 
 
 def transform_rows(message: Any) -> tuple[tuple[float, ...], ...]:
-    """Rows of a transform: unlike arrays they can be compared as a whole."""
+    """Rows of a transform: unlike arrays they can be compared as a whole.
+
+    Args:
+        message: foxglove.FrameTransform.
+
+    Raises:
+        DuagError: numbers that are not finite, or a quaternion of no length.
+    """
     return tuple(tuple(row) for row in messages.unpack_transform(message).tolist())
 
 
@@ -200,7 +283,17 @@ def _depth_image(record: Record, scale: float, camera: PinholeCamera) -> NDArray
 
 
 def check_size(record: Record, width: int, height: int, camera: PinholeCamera) -> None:
-    """Refuse an image that does not have the size of its calibration."""
+    """Refuse an image that does not have the size of its calibration.
+
+    Args:
+        record: the image, for the line of the error.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        camera: of the calibration.
+
+    Raises:
+        DuagError: the sizes differ.
+    """
     if (width, height) != (camera.width, camera.height):
         raise DuagError(
             f"{_where(record)} is {width}x{height}, "

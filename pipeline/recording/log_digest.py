@@ -20,7 +20,14 @@ def stated_digest(path: Path) -> str | None:
 
 
 def content_digest(path: Path) -> str:
-    """64 hex characters that name what a log says, however its file is chunked and compressed."""
+    """64 hex characters that name what a log says, however its file is chunked and compressed.
+
+    Args:
+        path: of the log.
+
+    Raises:
+        DuagError: the log is damaged.
+    """
     with LogFile(path) as log:
         content = ContentDigest()
         for record in log.records(None):

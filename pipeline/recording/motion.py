@@ -32,7 +32,12 @@ class MotionPrior(Protocol):
     """Says how the camera moved."""
 
     def between(self, start_ns: int, stop_ns: int) -> Motion | None:
-        """The motion from one time to a later one; None where the sensor does not reach or has a gap."""
+        """The motion from one time to a later one; None where the sensor does not reach or has a gap.
+
+        Args:
+            start_ns: time of the first pose, ns.
+            stop_ns: time of the second pose, ns, not earlier.
+        """
         ...
 
 
@@ -50,6 +55,12 @@ class OdometryPrior:
         self.T_odometry_camera = np.asarray(T_odometry_camera, dtype=np.float64)
 
     def between(self, start_ns: int, stop_ns: int) -> Motion | None:
+        """The motion between two times, interpolated; None where the messages do not reach or have a gap.
+
+        Args:
+            start_ns: time of the first pose, ns.
+            stop_ns: time of the second pose, ns, not earlier.
+        """
         start, stop = self._at(start_ns), self._at(stop_ns)
         if start is None or stop is None:
             return None
@@ -83,6 +94,12 @@ class GyroPrior:
         self.rates_camera = np.asarray(rates_camera, dtype=np.float64)
 
     def between(self, start_ns: int, stop_ns: int) -> Motion | None:
+        """The rotation between two times; None where the rates do not reach or have a gap.
+
+        Args:
+            start_ns: time of the first pose, ns.
+            stop_ns: time of the second pose, ns, not earlier.
+        """
         stamps = self.stamps_ns
         first, last = (int(np.searchsorted(stamps, t)) for t in (start_ns, stop_ns))
         if len(stamps) < 2 or start_ns < stamps[0] or stop_ns > stamps[-1]:
@@ -100,6 +117,10 @@ class GyroPrior:
 
 def motion_prior(log: LogFile, robot: str) -> MotionPrior | None:
     """The best prior that a log has: an odometry, then an IMU; None if it has neither.
+
+    Args:
+        log: of the robot.
+        robot: whose topics are read.
 
     Raises:
         DuagError: a message that cannot be read, or an IMU without its pose in the camera.

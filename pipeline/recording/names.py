@@ -18,7 +18,14 @@ RANGE_SIGMA_KEY = "range_sigma"  # channel metadata of a LiDAR: standard deviati
 
 
 def is_mcap(path: Path) -> bool:
-    """Whether a file begins or ends as MCAP does, whatever else is wrong with it."""
+    """Whether a file begins or ends as MCAP does, whatever else is wrong with it.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
     with path.open("rb") as stream:
         head = stream.read(len(MAGIC))
         stream.seek(-len(head), os.SEEK_END)

@@ -23,14 +23,23 @@ Picture = NDArray[np.uint8]
 
 
 def some_frames(log: RgbdLog, count: int = SHOWN) -> list[RgbdFrame]:
-    """Frames spread evenly over a log."""
+    """Frames spread evenly over a log.
+
+    Args:
+        log: of the robot.
+        count: number of frames, fewer if the log has fewer.
+    """
     chosen = np.unique(np.linspace(0, len(log) - 1, count).astype(int))
     return [log.frame(index) for index in chosen.tolist()]
 
 
 def reach(frames: Sequence[RgbdFrame]) -> dict[str, Any]:
     """Depth of some frames: "depth_m" at 1, 50 and 99 % of the known pixels (None if there is none), and the share
-    "with_depth"; every 4th row and column counts."""
+    "with_depth"; every 4th row and column counts.
+
+    Args:
+        frames: one at least; depth [h, w], meters, 0 = unknown.
+    """
     depth = np.concatenate([frame.depth[::4, ::4].ravel() for frame in frames])
     known = depth[depth > 0]
     percentiles = np.percentile(known, (1, 50, 99)).tolist() if len(known) else None

@@ -131,6 +131,9 @@ hand_down(_known, _learn)
 def verify(path: Path) -> None:
     """Read a log once and compare all its checksums, unless this process has done so and the file is unchanged.
 
+    Args:
+        path: of the log.
+
     Raises:
         DuagError: missing, empty, no MCAP file, cut short, or any byte that differs from what was written.
     """
@@ -227,7 +230,11 @@ class LogFile:
         return schema.name, schema.data
 
     def records(self, topics: Sequence[str] | None) -> Iterator[Record]:
-        """All messages of some topics, or of all, in the order of the log."""
+        """All messages of some topics, or of all, in the order of the log.
+
+        Args:
+            topics: full names; None: all.
+        """
         for topic in self.channels if topics is None else topics:
             check_read(self.path, topic)
         with parsing(self.path, self._stream):
@@ -263,7 +270,11 @@ class LogFile:
             ]
 
     def entries(self, topic: str) -> list[tuple[int, int, int]]:
-        """(log time, start of the chunk in the file, offset in the chunk) of every message of a topic, in log order."""
+        """(log time, start of the chunk in the file, offset in the chunk) of every message of a topic, in log order.
+
+        Args:
+            topic: full name; one that the log lacks has no entries.
+        """
         check_read(self.path, topic)
         if topic not in self.channels:
             return []
@@ -308,7 +319,12 @@ class LogFile:
         return time_ns
 
     def record_at(self, topic: str, entry: tuple[int, int, int]) -> Record:
-        """The message at an entry of `entries(topic)`; the last few chunks are kept unpacked."""
+        """The message at an entry of `entries(topic)`; the last few chunks are kept unpacked.
+
+        Args:
+            topic: full name.
+            entry: log time (ns), start of the chunk and offset in it, bytes.
+        """
         check_read(self.path, topic)
         _, start, offset = entry
         with parsing(self.path, self._stream):
@@ -375,6 +391,10 @@ def merge(paths: Sequence[Path], topics: Iterable[str] | None = None) -> Iterato
 
 
 def log_metadata(path: Path) -> dict[str, str]:
-    """What was given to the writer of the log: the robot and the metadata given to `LogWriter`."""
+    """What was given to the writer of the log: the robot and the metadata given to `LogWriter`.
+
+    Args:
+        path: of the log.
+    """
     with LogFile(path) as log:
         return dict(log.metadata()).get(LOG_RECORD, {})

@@ -38,6 +38,14 @@ TRUTH = ".groundtruth.mcap"  # how the names of true logs end
 def recover(source: Path, out: Path, force: bool = False) -> list[Salvage]:
     """Write what can be read of a log, or of a recording, into a new log or recording.
 
+    Args:
+        source: a damaged log, or a folder of logs.
+        out: the new log or recording.
+        force: replace what `out` names.
+
+    Returns:
+        What became of every log.
+
     Raises:
         DuagError: nothing can be read, or `out` exists.
     """

@@ -14,7 +14,12 @@ MOST_SAMPLES = 64_000_000  # of a depth image that is registered; each takes twe
 
 
 def sample_steps(depth_camera: PinholeCamera, camera: PinholeCamera) -> int:
-    """Samples per pixel of the depth camera, along either axis, that leave no gaps in the other camera."""
+    """Samples per pixel of the depth camera, along either axis, that leave no gaps in the other camera.
+
+    Args:
+        depth_camera: that measured the depth.
+        camera: into whose pixels it is moved.
+    """
     growth = max(camera.fx / depth_camera.fx, camera.fy / depth_camera.fy)
     return max(1, int(np.ceil(1.5 * growth)))
 

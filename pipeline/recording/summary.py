@@ -25,8 +25,14 @@ GAP_RATIO = 1.5  # an interval this much longer than the median one is a gap
 def info(path: Path) -> dict[str, Any]:
     """What is in a log, a recording or a run: topics, counts, rates, times, extents, gaps, digests, warnings.
 
+    Args:
+        path: of a log, a recording or a run.
+
     Returns:
         Plain numbers and text, ready for JSON; "kind" is "log", "recording" or "run". What is not known is None.
+
+    Raises:
+        DuagError: it is none of these, or a log is damaged.
     """
     path = Path(path)
     if path.is_file():
@@ -164,7 +170,15 @@ def _lens_info(lens: Lens | None) -> dict[str, Any] | None:
 
 
 def write_preview_of(path: Path, out: Path) -> None:
-    """Write a picture of a recording, or of the log of one robot; see `preview.write_preview`."""
+    """Write a picture of a recording, or of the log of one robot; see `preview.write_preview`.
+
+    Args:
+        path: of a recording or a log.
+        out: of the PNG; must not exist.
+
+    Raises:
+        DuagError: `out` exists, or what is shown cannot be read.
+    """
     path = Path(path)
     if path.is_file():
         logs = [path]
@@ -175,7 +189,11 @@ def write_preview_of(path: Path, out: Path) -> None:
 
 
 def format_info(content: Mapping[str, Any]) -> str:
-    """The result of `info` as text for people."""
+    """The result of `info` as text for people.
+
+    Args:
+        content: as `info` returns it.
+    """
     if content["kind"] == "log":
         lines = _log_lines(content)
     elif content["kind"] == "run":

@@ -25,7 +25,11 @@ CHUNK_BYTES = 1 << 20
 
 
 def mcap_writer(stream: IO[bytes]) -> Writer:
-    """A writer with the settings of our logs, not yet started."""
+    """A writer with the settings of our logs, not yet started.
+
+    Args:
+        stream: that takes the bytes.
+    """
     return Writer(
         stream,
         chunk_size=CHUNK_BYTES,

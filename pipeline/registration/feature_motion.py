@@ -101,7 +101,14 @@ def matched_features(
 def motion_of_points(
     points_first: Array, points_second: Array, config: GeometricVerificationConfig, rng: np.random.Generator
 ) -> FeatureMotion:
-    """The motion that most matched points [n, 3] agree on."""
+    """The motion that most matched points agree on.
+
+    Args:
+        points_first: [n, 3], meters, camera frame of the first view.
+        points_second: [n, 3], the same points in the camera frame of the second.
+        config: distance of an inlier, number of hypotheses, inliers needed.
+        rng: draws the hypotheses.
+    """
     n = len(points_first)
     if n < config.min_inliers:
         return FeatureMotion(None, n, 0, config.min_inliers)
@@ -120,7 +127,15 @@ def motion_of_others(
     config: GeometricVerificationConfig,
     rng: np.random.Generator,
 ) -> FeatureMotion | None:
-    """The motion of matched points [n, 3] that are far from a given one; None if too few agree."""
+    """The motion of matched points that are far from a given one; None if too few agree.
+
+    Args:
+        T_first_second: [4, 4], the given motion.
+        points_first: [n, 3], meters, camera frame of the first view.
+        points_second: [n, 3], the same points in the camera frame of the second.
+        config: as in `motion_of_points`.
+        rng: draws the hypotheses.
+    """
     others = _apart(points_first, points_second, T_first_second, config) > APART
     motion = motion_of_points(points_first[others], points_second[others], config, rng)
     return replace(motion, matches=len(others)) if motion.accepted else None

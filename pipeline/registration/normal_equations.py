@@ -50,7 +50,11 @@ class NormalEquations:
         return replace(self, gradient=self.gradient + self.H @ by)
 
     def divided(self, factor: float) -> NormalEquations:
-        """The same with all weights divided by a factor."""
+        """The same with all weights divided by a factor.
+
+        Args:
+            factor: positive.
+        """
         return replace(
             self,
             H=self.H / factor,

@@ -44,7 +44,11 @@ _STYLE: dict[Any, Any] = {
 
 
 def color_of(index: int) -> str:
-    """Color of the robot (or other series) number `index`."""
+    """Color of the robot (or other series) number `index`.
+
+    Args:
+        index: from 0; colors come again after the last one.
+    """
     return COLORS[index % len(COLORS)]
 
 
@@ -179,7 +183,14 @@ def lines(
 
 @_styled
 def stacked(x: Numbers, parts: Mapping[str, Numbers], x_label: str, y_label: str) -> Figure:
-    """Stacked areas: how a total divides into parts over a common axis."""
+    """Stacked areas: how a total divides into parts over a common axis.
+
+    Args:
+        x: common axis [n]; without numbers the figure is empty.
+        parts: values [n] by label, lowest first.
+        x_label: of the axis, with its unit.
+        y_label: of the axis, with its unit.
+    """
     from matplotlib.ticker import MaxNLocator
 
     figure, axes = _figure(5.4, 3.2)
@@ -203,7 +214,13 @@ def stacked(x: Numbers, parts: Mapping[str, Numbers], x_label: str, y_label: str
 
 @_styled
 def bars(names: Sequence[str], parts: Mapping[str, Sequence[float]], x_label: str) -> Figure:
-    """Horizontal stacked bars: one bar per name, one color per part."""
+    """Horizontal stacked bars: one bar per name, one color per part.
+
+    Args:
+        names: of the bars, from the top.
+        parts: one number per bar, by label, from the left.
+        x_label: of the axis, with its unit.
+    """
     from matplotlib.ticker import MaxNLocator
 
     figure, axes = _figure(5.4, 1.1 + 0.34 * max(1, len(names)))
@@ -224,7 +241,11 @@ def bars(names: Sequence[str], parts: Mapping[str, Sequence[float]], x_label: st
 
 @_styled
 def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
-    """Predicted against observed error per decile, millimeters, both axes logarithmic; the diagonal is right."""
+    """Predicted against observed error per decile, millimeters, both axes logarithmic; the diagonal is right.
+
+    Args:
+        bins: (predicted, observed) error of every decile, meters, by robot.
+    """
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     figure, axes = _figure(5.4, 4.0)

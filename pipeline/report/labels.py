@@ -15,7 +15,11 @@ NONE = "–"
 
 
 def bytes_text(count: float) -> str:
-    """Bytes with a decimal prefix: 1 kB is 1000 B."""
+    """Bytes with a decimal prefix: 1 kB is 1000 B.
+
+    Args:
+        count: number of bytes.
+    """
     for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:
             return f"{count / size:.3g} {unit}"
@@ -23,7 +27,11 @@ def bytes_text(count: float) -> str:
 
 
 def meters_text(value_m: float) -> str:
-    """Meters, or millimeters below a tenth of a meter."""
+    """Meters, or millimeters below a tenth of a meter.
+
+    Args:
+        value_m: meters.
+    """
     if abs(value_m) < 0.1:
         millimeters = 1e3 * abs(value_m)
         if 0.0 < millimeters < 1e-3:
@@ -33,7 +41,12 @@ def meters_text(value_m: float) -> str:
 
 
 def text(name: str, value: Any) -> str:
-    """A metric's value with its unit, as the report prints it; a dash for a value that is absent."""
+    """A metric's value with its unit, as the report prints it; a dash for a value that is absent.
+
+    Args:
+        name: of the metric, as in metrics.json; says its unit.
+        value: number, text, truth value or None.
+    """
     if value is None:
         return NONE
     if isinstance(value, bool):
@@ -216,7 +229,11 @@ def loop_closures(decisions: Sequence[Any]) -> list[dict[str, Any]]:
 
 
 def verdict_counts(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """How many candidates have each verdict, the most frequent first."""
+    """How many candidates have each verdict, the most frequent first.
+
+    Args:
+        rows: candidates, each with "verdict".
+    """
     return dict(Counter(row["verdict"] for row in rows).most_common())
 
 
@@ -247,7 +264,11 @@ def rows(
 
 
 def pixel_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Calibration of rendered depth: a row of "name" and "cells" for each map and set of views that has numbers."""
+    """Calibration of rendered depth: a row of "name" and "cells" for each map and set of views that has numbers.
+
+    Args:
+        metrics: content of metrics.json.
+    """
     return [
         {
             "name": f"{MAPS[kind]}, {VIEW_SETS[view_set]}",
@@ -263,12 +284,21 @@ def pixel_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def is_scored(metrics: Mapping[str, Any], kind: str) -> bool:
-    """Whether a map exists in this run and was rendered at some view."""
+    """Whether a map exists in this run and was rendered at some view.
+
+    Args:
+        metrics: content of metrics.json.
+        kind: name of the map in the section "rendering".
+    """
     return any(found["views"] for found in metrics["rendering"].get(kind, {}).values())
 
 
 def compared_sets(metrics: Mapping[str, Any]) -> list[str]:
-    """Sets of views at which some map was rendered: a robot alone has no peers' views."""
+    """Sets of views at which some map was rendered: a robot alone has no peers' views.
+
+    Args:
+        metrics: content of metrics.json.
+    """
     sections = [metrics["rendering"][kind] for kind in COMPARED]
     return [s for s in COMPARED_SETS if any(section[s]["views"] for section in sections)]
 
@@ -276,7 +306,12 @@ def compared_sets(metrics: Mapping[str, Any]) -> list[str]:
 def without_empty(
     columns: Mapping[str, tuple[str, str]], sections: Sequence[Mapping[str, Any]]
 ) -> dict[str, tuple[str, str]]:
-    """The columns that have a value in at least one section: a column of dashes says nothing."""
+    """The columns that have a value in at least one section: a column of dashes says nothing.
+
+    Args:
+        columns: label and meaning by name of the metric.
+        sections: values by name of the metric; None: absent.
+    """
     return {name: words for name, words in columns.items() if any(s.get(name) is not None for s in sections)}
 
 
@@ -291,13 +326,20 @@ def _compared(metrics: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, 
 
 
 def comparison_columns(metrics: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """The columns of COMPARISON that have a value in this run."""
+    """The columns of COMPARISON that have a value in this run.
+
+    Args:
+        metrics: content of metrics.json.
+    """
     sets = compared_sets(metrics)
     return without_empty(COMPARISON, [found[s] for _, _, found in _compared(metrics) for s in sets])
 
 
 def comparison_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A robot's maps side by side, for all robots and for each: own views, peers' views, both.
+
+    Args:
+        metrics: content of metrics.json.
 
     Returns:
         Rows of "robot", "map", "first" (of its robot) and "values": `comparison_columns` for each of `compared_sets`.
@@ -315,7 +357,11 @@ def comparison_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def comparison_text(metrics: Mapping[str, Any]) -> str:
-    """The same as lines of text, without units: dB, mm, mm, %; for own, peers' and team's views."""
+    """The same as lines of text, without units: dB, mm, mm, %; for own, peers' and team's views.
+
+    Args:
+        metrics: content of metrics.json.
+    """
     scale = {"psnr_db": (1.0, 2), "depth_completeness": (100.0, 1)}
     heads = {
         "psnr_db": "PSNR, dB",

@@ -71,7 +71,13 @@ def write_report(run_dir: Path, recording: Path, *, workers: int = 1) -> Path:
 
 
 def content(run: RunFolder, source: Recording, workers: int) -> dict[str, Any]:
-    """Everything that the template shows, by name."""
+    """Everything that the template shows, by name.
+
+    Args:
+        run: evaluated, with metrics.json.
+        source: its recording.
+        workers: robots drawn at the same time; changes no bit.
+    """
     metrics = run.metrics
     reasons = metrics["reasons"]
     session = Session(run)

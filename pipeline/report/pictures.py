@@ -15,12 +15,21 @@ NOTHING = (236, 239, 242)  # where there is no value: the light gray of the page
 
 
 def svg_uri(svg: str) -> str:
-    """data: URI of an SVG text."""
+    """data: URI of an SVG text.
+
+    Args:
+        svg: the text.
+    """
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode("utf-8")).decode("ascii")
 
 
 def jpeg_uri(rgb: Image, width: int) -> str:
-    """data: URI of an 8-bit RGB image [h, w, 3], scaled to `width` pixels."""
+    """data: URI of an 8-bit RGB image as JPEG.
+
+    Args:
+        rgb: uint8 [h, w, 3].
+        width: to which the image is scaled, pixels; the shape stays.
+    """
     import cv2
 
     height = max(1, round(rgb.shape[0] * width / rgb.shape[1]))
@@ -31,14 +40,26 @@ def jpeg_uri(rgb: Image, width: int) -> str:
 
 
 def to_uint8(color: Image) -> NDArray[np.uint8]:
-    """8-bit RGB of colors in 0..1, clamped."""
+    """8-bit RGB of colors in 0..1, clamped.
+
+    Args:
+        color: [...], 0..1.
+    """
     return np.rint(np.clip(color, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def colored(
     values: Image, low: float, high: float, *, valid: Image, palette: str = "viridis"
 ) -> NDArray[np.uint8]:
-    """8-bit RGB [h, w, 3] of a scalar image [h, w]: `low` to `high` over a palette, gray where not valid."""
+    """8-bit RGB [h, w, 3] of a scalar image: `low` to `high` over a palette, gray where not valid.
+
+    Args:
+        values: [h, w].
+        low: value at the low end of the palette.
+        high: value at the high end.
+        valid: bool [h, w].
+        palette: name of a colormap of matplotlib.
+    """
     import matplotlib as mpl
 
     span = high - low if high > low else 1.0
@@ -49,13 +70,24 @@ def colored(
 
 
 def scale_uri(palette: str) -> str:
-    """data: URI of a horizontal strip from the low to the high end of a palette."""
+    """data: URI of a horizontal strip from the low to the high end of a palette.
+
+    Args:
+        palette: name of a colormap of matplotlib.
+    """
     ramp = np.tile(np.linspace(0.0, 1.0, 256), (12, 1))
     return jpeg_uri(colored(ramp, 0.0, 1.0, valid=np.ones(ramp.shape, dtype=bool), palette=palette), 256)
 
 
 def color_by(values: Image, low: float, high: float, palette: str = "viridis") -> NDArray[np.float32]:
-    """Colors float32 [n, 3] in 0..1 of scalars [n], clamped to `low`..`high`."""
+    """Colors float32 [n, 3] in 0..1 of scalars [n], clamped to `low`..`high`.
+
+    Args:
+        values: [n].
+        low: value at the low end of the palette.
+        high: value at the high end.
+        palette: name of a colormap of matplotlib.
+    """
     import matplotlib as mpl
 
     unit = np.clip((values - low) / (high - low if high > low else 1.0), 0.0, 1.0)

@@ -22,14 +22,25 @@ ROBOT_RESULTS = (
 
 
 def result_files(run: Path) -> list[Path]:
-    """Files of a run that its digest covers, relative to the run, sorted."""
+    """Files of a run that its digest covers, relative to the run, sorted.
+
+    Args:
+        run: its folder.
+    """
     found = [p for name in TEAM_RESULTS if (p := run / name).is_file()]
     found += [p for p in (run / "robots").rglob("*") if p.suffix in RESULT_SUFFIXES]
     return sorted(p.relative_to(run) for p in found)
 
 
 def digest_file(path: Path) -> str:
-    """64 hex characters: over the messages of a log, over the bytes of any other file."""
+    """64 hex characters: over the messages of a log, over the bytes of any other file.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        DuagError: it cannot be read, or the log is damaged.
+    """
     if path.suffix == ".mcap":
         return content_digest(path)
     try:

@@ -348,7 +348,11 @@ def _is_number(value: object) -> bool:
 
 
 def position_information(geometry: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Position block [n, 3, 3], 1/m^2, of geometry information [n, 45] (upper triangle of 9x9, row-major)."""
+    """Position block [n, 3, 3], 1/m^2, of geometry information [n, 45] (upper triangle of 9x9, row-major).
+
+    Args:
+        geometry: [n, 45].
+    """
     values = geometry.astype(np.float64)
     row_1, row_2 = 9, 17  # places of the diagonal elements (1, 1) and (2, 2) in the upper triangle
     F = np.empty((len(values), 3, 3))

@@ -142,7 +142,11 @@ class SessionResult:
 
 
 def odometry_of(keyframes: Sequence[Keyframe]) -> list[RelativePose]:
-    """Odometry of a robot, in order of its keyframes: each to the one that it was registered to."""
+    """Odometry of a robot, in order of its keyframes: each to the one that it was registered to.
+
+    Args:
+        keyframes: of one robot, in order.
+    """
     return [
         RelativePose(k.previous_index, k.keyframe_index, k.T_previous_keyframe, k.information)
         for k in keyframes
@@ -196,6 +200,9 @@ def _tied(factors: Sequence[KeyframeFactor]) -> set[int]:
 
 def load(source: AgentInput) -> RobotData:
     """One robot's files in memory; its sensor log is opened when an image is asked for.
+
+    Args:
+        source: the files.
 
     Raises:
         DuagError: a file lacks what it should hold, or two files do not belong together.

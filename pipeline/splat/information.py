@@ -54,13 +54,22 @@ WORST_CONDITION = 1e12
 
 
 def unpack_symmetric(upper: ArrayLike, size: int) -> Array:
-    """Symmetric matrices [..., size, size] of their upper triangles, row by row."""
+    """Symmetric matrices [..., size, size] of their upper triangles, row by row.
+
+    Args:
+        upper: [..., size (size + 1) / 2].
+        size: rows of a matrix.
+    """
     upper = np.asarray(upper, dtype=np.float64)
     return np.take(upper, _places_of_elements(size), axis=-1).reshape(*upper.shape[:-1], size, size)
 
 
 def pack_symmetric(matrix: Array) -> Array:
-    """Upper triangles, row by row, of symmetric matrices [..., size, size]."""
+    """Upper triangles, row by row, of symmetric matrices.
+
+    Args:
+        matrix: [..., size, size]; only the upper triangle is read.
+    """
     size = matrix.shape[-1]
     return np.take(matrix.reshape(*matrix.shape[:-2], size * size), _places_of_upper(size), axis=-1)
 
@@ -95,27 +104,49 @@ def pack_information(mean: Array, log_covariance: Array, color: Array, opacity: 
 
 
 def mean_block(information: Array) -> Array:
-    """[n, 3, 3] of information [n, 31], 1/m^2."""
+    """[n, 3, 3] of information [n, 31], 1/m^2.
+
+    Args:
+        information: [n, 31].
+    """
     return unpack_symmetric(information[:, MEAN_INFORMATION], 3)
 
 
 def log_covariance_block(information: Array) -> Array:
-    """[n, 6, 6] of information [n, 31], over vec log Sigma."""
+    """[n, 6, 6] of information [n, 31], over vec log Sigma.
+
+    Args:
+        information: [n, 31].
+    """
     return unpack_symmetric(information[:, LOG_COVARIANCE_INFORMATION], 6)
 
 
 def unpack_geometry(geometry: ArrayLike) -> Array:
-    """Symmetric matrices [n, 9, 9] of geometry [n, 45]."""
+    """Symmetric matrices [n, 9, 9] of geometry [n, 45].
+
+    Args:
+        geometry: [n, 45].
+    """
     return unpack_symmetric(geometry, 9)
 
 
 def pack_geometry(matrices: Array) -> Array:
-    """Geometry [n, 45] of symmetric matrices [n, 9, 9]."""
+    """Geometry [n, 45] of symmetric matrices [n, 9, 9].
+
+    Args:
+        matrices: [n, 9, 9], over (mean in meters, vec log Sigma).
+    """
     return pack_symmetric(matrices)
 
 
 def information_of_geometry(geometry: ArrayLike, color: ArrayLike, opacity: ArrayLike) -> Array:
-    """Information [n, 31] of geometry [n, 45], color [n, 3] and opacity [n]; the cross terms are dropped."""
+    """Information [n, 31] of geometry [n, 45], color [n, 3] and opacity [n]; the cross terms are dropped.
+
+    Args:
+        geometry: [n, 45].
+        color: [n, 3], diagonal of the color.
+        opacity: [n], of the logit.
+    """
     upper = np.asarray(geometry, dtype=np.float64)
     out = np.empty((len(upper), INFORMATION_SIZE))
     out[:, MEAN_INFORMATION] = upper[:, _MEAN_PLACES]
@@ -126,7 +157,11 @@ def information_of_geometry(geometry: ArrayLike, color: ArrayLike, opacity: Arra
 
 
 def geometry_of_information(information: Array) -> Array:
-    """Geometry [n, 45] of information [n, 31]; the cross terms are zero."""
+    """Geometry [n, 45] of information [n, 31]; the cross terms are zero.
+
+    Args:
+        information: [n, 31].
+    """
     out = np.zeros((len(information), len(_ROWS)))
     out[:, _MEAN_PLACES] = information[:, MEAN_INFORMATION]
     out[:, _LOG_COVARIANCE_PLACES] = information[:, LOG_COVARIANCE_INFORMATION]
@@ -134,7 +169,11 @@ def geometry_of_information(information: Array) -> Array:
 
 
 def theta_of(gaussians: Gaussians) -> Array:
-    """theta [n, 13] of Gaussians, in their frame."""
+    """theta [n, 13] of Gaussians, in their frame.
+
+    Args:
+        gaussians: n, means in meters.
+    """
     return np.concatenate(
         [
             gaussians.means.astype(np.float64),

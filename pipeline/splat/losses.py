@@ -166,7 +166,11 @@ def depth_certainty(depth_m: Image, depth_sigma_m: Image | None, loss: DepthTrus
 
 
 def halve(image: NDArray) -> NDArray:
-    """Means of the 2x2 blocks of an image [H, W, ...]; a last odd row or column is cut."""
+    """Means of the 2x2 blocks of an image [H, W, ...]; a last odd row or column is cut.
+
+    Args:
+        image: [H, W, ...], floating point.
+    """
     h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     out = np.empty((h // 2, w // 2, *image.shape[2:]), image.dtype)
     for channel in np.ndindex(

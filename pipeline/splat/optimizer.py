@@ -75,6 +75,11 @@ class Adam:
     """
 
     def __init__(self, n: int = 0) -> None:
+        """Begin with Gaussians that were never optimized.
+
+        Args:
+            n: number of Gaussians.
+        """
         self._first, self._second = _zeros(n), _zeros(n)
         self._steps = np.zeros(n, np.int32)
         # running products, not powers: the same on every machine
@@ -113,14 +118,22 @@ class Adam:
             self._corrections[steps:] = 0.0
 
     def select(self, index: NDArray) -> None:
-        """Keep the state of the Gaussians of a mask or an index array, in that order."""
+        """Keep the state of the Gaussians of a mask or an index array, in that order.
+
+        Args:
+            index: bool mask [n], or indices [k].
+        """
         rows = rows_of(index)
         self._first = {name: moments.take(rows, axis=0) for name, moments in self._first.items()}
         self._second = {name: moments.take(rows, axis=0) for name, moments in self._second.items()}
         self._steps = self._steps.take(rows)
 
     def extend(self, n: int) -> None:
-        """Add n Gaussians at the end that were never optimized."""
+        """Add n Gaussians at the end that were never optimized.
+
+        Args:
+            n: number of new Gaussians.
+        """
         new = _zeros(n)
         self._first = {name: np.concatenate([moments, new[name]]) for name, moments in self._first.items()}
         self._second = {name: np.concatenate([moments, new[name]]) for name, moments in self._second.items()}
@@ -145,6 +158,11 @@ class Adam:
         Centers move by shares of the Gaussians' sizes, so that a scene ten times as large is trained alike.
 
         Source: Kingma and Ba, ICLR 2015, algorithm 1, with beta_2 = 0.99 (few steps per Gaussian).
+
+        Args:
+            gaussians: n, as many as the optimizer has.
+            gradients: derivatives of the loss by their parameters.
+            rates: step lengths.
         """
         touched = (gradients.opacity_logits != 0) | (gradients.colors != 0).any(axis=1)
         rows = np.flatnonzero(touched)

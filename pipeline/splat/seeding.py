@@ -164,6 +164,13 @@ def quadtree(
     wanted pixels within 5 % of the nearest one, so that a leaf on an edge belongs to the front surface. The detail
     threshold rises by steps of sqrt(2) until the leaves fit the budget; if the coarsest cells alone do not, every
     second, third, ... is taken.
+
+    Args:
+        color: [H, W, 3], RGB 0..1.
+        depth_m: [H, W], meters, 0 = unknown.
+        wanted: bool [H, W], pixels with depth that the map does not explain.
+        budget: largest number of leaves.
+        config: sides of the cells, pixels, and the detail threshold.
     """
     sides = config.cell_sizes_px
     grids = [_grid(color, depth_m, wanted, side) for side in sides]
@@ -283,6 +290,12 @@ def surface_normals(
     A plane n . X = 1 has inverse depth 1 / z = n . ray, affine in the pixel: fit that affine function over the
     pixels of a (2 radius + 1)^2 window within 5 % of the cell's inverse depth. Where it is not determined the
     normal is the viewing ray.
+
+    Args:
+        depth_m: [H, W], meters, 0 = unknown.
+        cells: n leaves of the quadtree.
+        camera: of the depth image.
+        radius_px: half side of the window, pixels.
     """
     n = len(cells.uv)
     slope, determined = np.zeros((n, 2)), np.zeros(n, bool)

@@ -39,6 +39,11 @@ class Inspector:
     """Questions about one run; logs are read when they are needed, and once."""
 
     def __init__(self, run: RunFolder) -> None:
+        """Take the run; its logs are read later.
+
+        Args:
+            run: that is asked about.
+        """
         self.run = run
 
     @cached_property
@@ -53,6 +58,9 @@ class Inspector:
 
     def round(self, index: int) -> Facts:
         """Where every robot stood in a round, and what was on the air.
+
+        Args:
+            index: of the round, from 0.
 
         Raises:
             DuagError: the session had fewer rounds.
@@ -153,6 +161,9 @@ class Inspector:
     def packet(self, number: int) -> Facts:
         """One packet, by its place in exchange.mcap, counting from 0.
 
+        Args:
+            number: of the packet.
+
         Raises:
             DuagError: there are fewer.
         """
@@ -213,6 +224,10 @@ class Inspector:
 
     def gaussian(self, robot: str, gaussian_id: int) -> Facts:
         """One Gaussian of a robot's own map: its value, who matched it, how its evidence traveled, what fusion did.
+
+        Args:
+            robot: name of the robot, or of a component.
+            gaussian_id: id of the Gaussian in that map.
 
         Raises:
             DuagError: no such robot, or no such Gaussian in its map.
@@ -306,7 +321,11 @@ def _described(theta: np.ndarray) -> Facts:
 
 
 def format_loop_closures(facts: Facts) -> str:
-    """Candidates for loop closures as a table, then how many have each verdict."""
+    """Candidates for loop closures as a table, then how many have each verdict.
+
+    Args:
+        facts: of the candidates, with "candidates" and "verdicts".
+    """
     rows = facts["candidates"]
     if not rows:
         return "no candidates: no keyframe of one robot resembled one of another"
@@ -319,7 +338,12 @@ def format_loop_closures(facts: Facts) -> str:
 
 
 def format_facts(facts: Facts, indent: int = 0) -> str:
-    """Facts as lines, a name and a value each, what belongs together indented."""
+    """Facts as lines, a name and a value each, what belongs together indented.
+
+    Args:
+        facts: by name: numbers, texts, lists and nested facts.
+        indent: spaces before every line.
+    """
     lines = []
     width = max((len(name) for name in facts), default=0)
     for name, value in facts.items():

@@ -92,6 +92,16 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
     """Write logs as one .rrd file: what Rerun reads from MCAP by itself, and depth as depth images with their unit.
 
     Rerun takes a depth image of Foxglove's schema for a gray image. Here its bytes become a depth image next to it.
+
+    Args:
+        logs: of robots with a camera.
+        out: name of the .rrd file.
+
+    Returns:
+        `out`.
+
+    Raises:
+        DuagError: a log cannot be read, or the file cannot be written.
     """
     import rerun as rr
     from rerun.chunk import Chunk, DeriveLens, LazyChunkStream, McapReader
@@ -203,6 +213,11 @@ def _open_window(rrd: Path) -> None:
 
 def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
     """Draw a file without a window and save the picture; a software renderer (Mesa lavapipe) is enough.
+
+    Args:
+        rrd: the .rrd file.
+        png: name of the picture; replaced if it exists.
+        timeout_s: longest wait for the data, seconds.
 
     Raises:
         DuagError: there is no graphics driver, or the viewer has not shown the data in time.

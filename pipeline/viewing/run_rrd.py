@@ -113,7 +113,12 @@ def rgba(text: str) -> list[int]:
 
 
 def thinned(gaussians: Gaussians, most: int) -> NDArray[np.int64]:
-    """Indices, ascending, of at most `most` Gaussians: those of the greatest opacity times area; ties by position."""
+    """Indices, ascending, of at most `most` Gaussians: those of the greatest opacity times area; ties by position.
+
+    Args:
+        gaussians: of a map.
+        most: largest number of Gaussians that stay.
+    """
     if len(gaussians) <= most:
         return np.arange(len(gaussians))
     scales = np.sort(gaussians.log_scales.astype(np.float64), axis=1)
