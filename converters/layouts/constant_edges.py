@@ -32,22 +32,27 @@ class ConstantEdges:
         self._often: NDArray[np.uint16] | None = None  # images with a step up or down to the pixel, in x or y
         self._images = 0
 
-    def add(self, image: NDArray[np.uint8]) -> None:
+    def add(self, value: NDArray[np.uint8]) -> None:
         """Take an image of the recording.
 
         Args:
-            image: [h, w, 3], all of one size; others are left out.
+            value: [h, w], brightest of the three colors; all of one size, others are left out.
         """
-        gray = image.max(axis=2).astype(np.int16)
-        across, down = np.zeros_like(gray), np.zeros_like(gray)
-        across[:, 1:], down[1:] = gray[:, 1:] - gray[:, :-1], gray[1:] - gray[:-1]
+        import cv2
+
         if self._often is None:
-            self._often = np.zeros((4, *gray.shape), dtype=np.uint16)
-        if gray.shape != self._often.shape[1:] or self._images == np.iinfo(np.uint16).max:
+            self._often = np.zeros((4, *value.shape), dtype=np.uint16)
+        if value.shape != self._often.shape[1:] or self._images == np.iinfo(np.uint16).max:
             return
         self._images += 1
-        for count, steps in zip(self._often, (across, -across, down, -down), strict=True):
-            count += steps > STEP
+        right, left, lower, upper = value[:, 1:], value[:, :-1], value[1:], value[:-1]
+        for count, high, low in (
+            (self._often[0, :, 1:], right, left),
+            (self._often[1, :, 1:], left, right),
+            (self._often[2, 1:], lower, upper),
+            (self._often[3, 1:], upper, lower),
+        ):
+            count += cv2.subtract(high, low) > STEP  # of bytes: 0 where the other is brighter
 
     def result(self, outside: Mask | None, spread: NDArray[np.floating]) -> Mask | None:
         """Pixels that show the scene, bool [h, w]; None where nothing else is found, or too few images could tell.

@@ -43,9 +43,9 @@ class FoundRegions:
         if is_held_out(index) or (index % every and stamp_ns < self._next_look_ns):
             return
         self._next_look_ns = stamp_ns + EVERY_NS
-        if (image := self._decoded(color)) is not None:  # else reading the recording will complain
-            self._black.add(image)
-            self._edges.add(image)
+        if (value := self._value(color)) is not None:  # else reading the recording will complain
+            self._black.add(value)
+            self._edges.add(value)
         if depth is not None:
             self._body.add(depth)
 
@@ -64,9 +64,14 @@ class FoundRegions:
             masks |= {} if drawn is None else {"drawn": drawn}
         return masks
 
-    def _decoded(self, color: bytes) -> NDArray[np.uint8] | None:
-        """An image [h, w, 3], blue, green, red, of the recording's camera; None if it cannot be read."""
+    def _value(self, color: bytes) -> NDArray[np.uint8] | None:
+        """The brightest of the three colors, [h, w], as the recording's camera sees it; None: it cannot be read."""
         import cv2
 
         image = decode_image(color, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        return image if image is None or self._maps is None else rectified(image, self._maps)
+        if image is None:
+            return None
+        if self._maps is not None:
+            image = rectified(image, self._maps)
+        blue, green, red = image[..., 0], image[..., 1], image[..., 2]
+        return np.maximum(np.maximum(blue, green), red)  # ten times as fast as max(axis=2)

@@ -60,16 +60,14 @@ class BlackBorder:
         self._images, self._every = 0, 1
         self._small: list[NDArray[np.float32]] = []
 
-    def add(self, image: NDArray[np.uint8]) -> None:
-        """Take a color image of the recording; a few of every second do.
+    def add(self, value: NDArray[np.uint8]) -> None:
+        """Take an image of the recording; a few of every second do.
 
         Args:
-            image: [h, w, 3], blue, green, red.
+            value: [h, w], brightest of the three colors.
         """
         import cv2
 
-        blue, green, red = image[..., 0], image[..., 1], image[..., 2]
-        value = np.maximum(np.maximum(blue, green), red)  # ten times as fast as max(axis=2)
         if np.percentile(value, BRIGHT_PERCENT) > BRIGHT and (
             self._brightest is None or value.shape == self._brightest.shape
         ):

@@ -11,7 +11,7 @@ from duagc.pipeline.base.held_out import is_held_out
 @pytest.mark.parametrize("rate_hz", [30.0, 4.0, 1.0])
 def test_frames_that_are_held_out_decide_nothing(monkeypatch: pytest.MonkeyPatch, rate_hz: float) -> None:
     regions, looked_at = FoundRegions(), list[int]()
-    monkeypatch.setattr(regions._black, "add", lambda image: looked_at.append(int(image[0, 0, 0])))
+    monkeypatch.setattr(regions._black, "add", lambda value: looked_at.append(int(value[0, 0])))
     monkeypatch.setattr(regions._body, "add", lambda depth: looked_at.append(int(depth[0, 0])))
     for index in range(200):
         depth = np.full((2, 2), index, np.uint16)
