@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline import steps, watch
-from duagc.pipeline.base import worker_reports
+from duagc.pipeline.base import plotting, worker_reports
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.thread_share import SharedThreads, ThreadShare, keep_share
 from duagc.pipeline.base.workers import worker_pool
@@ -28,7 +28,7 @@ from duagc.pipeline.runs import stages
 
 FUSION = "duagc.pipeline.fusion.stage"
 EXCHANGE = ("duagc.pipeline.exchange.session",)
-VIEW = ("duagc.pipeline.viewing.run_rrd", "rerun.blueprint", "matplotlib")
+VIEW = ("duagc.pipeline.viewing.run_rrd", "rerun.blueprint")
 
 
 def import_next(plan: RunPlan) -> None:
@@ -40,6 +40,7 @@ def import_next(plan: RunPlan) -> None:
     wanted: tuple[str, ...] = EXCHANGE if plan.has(stages.EXCHANGE) else ()
     if plan.has(stages.VIEW) and not plan.has(stages.EVALUATION):  # else another process shows the run
         wanted += VIEW
+        plotting.matplotlib()
     for module in wanted:
         with suppress(ImportError):
             _import(module)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base import plotting
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -69,9 +71,7 @@ def _styled(draw: Callable[..., Figure]) -> Callable[..., str]:
 
     @wraps(draw)
     def styled(*args: Any, **kwargs: Any) -> str:
-        import matplotlib as mpl
-
-        with mpl.rc_context(_STYLE):
+        with plotting.style(_STYLE):
             buffer = io.StringIO()
             draw(*args, **kwargs).savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
             return buffer.getvalue()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.files import encode_jpeg
+from duagc.pipeline.base.plotting import matplotlib
 
 Image = NDArray[Any]
 NOTHING = (236, 239, 242)  # where there is no value: the light gray of the page
@@ -60,11 +61,9 @@ def colored(
         valid: bool [h, w].
         palette: name of a colormap of matplotlib.
     """
-    import matplotlib as mpl
-
     span = high - low if high > low else 1.0
     unit = np.clip((np.where(valid, values, low) - low) / span, 0.0, 1.0)
-    rgb = (mpl.colormaps[palette](unit)[..., :3] * 255.0).round().astype(np.uint8)
+    rgb = (matplotlib().colormaps[palette](unit)[..., :3] * 255.0).round().astype(np.uint8)
     rgb[~valid] = NOTHING
     return rgb
 
@@ -88,7 +87,5 @@ def color_by(values: Image, low: float, high: float, palette: str = "viridis") -
         high: value at the high end.
         palette: name of a colormap of matplotlib.
     """
-    import matplotlib as mpl
-
     unit = np.clip((values - low) / (high - low if high > low else 1.0), 0.0, 1.0)
-    return np.asarray(mpl.colormaps[palette](unit)[:, :3], dtype=np.float32)
+    return np.asarray(matplotlib().colormaps[palette](unit)[:, :3], dtype=np.float32)
