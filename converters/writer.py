@@ -49,9 +49,9 @@ SPELLING_ALPHABET = """
 """
 ROBOT_NAMES = tuple(SPELLING_ALPHABET.split())
 FOUND = {
-    "black": "are black in all images",
-    "drawn": "have edges that stay where they are while the camera moves, as text drawn over the images has",
-    "body": "keep their depth while the camera moves, as what carries it does",
+    "black": ", at the border, are black in all images",
+    "drawn": " have edges that stay where they are while the camera moves, as text drawn over the images has",
+    "body": ", at the border, keep their depth while the camera moves, as what carries it does",
 }
 """Regions that do not show the scene, by the name that `RobotWriter` gives them."""
 UNITS = {"time": "ns", "length": "m", "depth": "depth_scale_m per unit, along z, 0 = none", "angle": "rad"}
@@ -150,7 +150,7 @@ class RecordingWriter:
         for name, words in FOUND.items():
             if row.get(f"{name}_share"):
                 self.warnings.append(
-                    f"{robot}: {row[f'{name}_share']:.1%} of the pixels, at the border, {words}; left out"
+                    f"{robot}: {row[f'{name}_share']:.1%} of the pixels{words}; left out"
                 )
         self._robots[robot] = row
 
