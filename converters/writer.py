@@ -149,9 +149,7 @@ class RecordingWriter:
             raise ValueError(f"robot {robot} is in the recording already")
         for name, words in FOUND.items():
             if row.get(f"{name}_share"):
-                self.warnings.append(
-                    f"{robot}: {row[f'{name}_share']:.1%} of the pixels{words}; left out"
-                )
+                self.warnings.append(f"{robot}: {row[f'{name}_share']:.1%} of the pixels{words}; left out")
         self._robots[robot] = row
 
     def add_geometry(self, write: Callable[[Path], None]) -> None:
