@@ -72,13 +72,23 @@ def moves(log: RgbdLog, config: MotionChecks, *, as_range: bool = False) -> list
     last = len(stamps) - 1
     for first in np.unique(np.linspace(0, last - 1, min(config.pairs, last)).astype(int)).tolist():
         near = int(np.searchsorted(stamps, stamps[first] + round(1e9 * config.pair_s), side="right")) - 1
-        frame = log.frame(frames[first])
-        for second in sorted({max(near, first + 1), first + 1}, reverse=True):
-            move = _move(frame, log.frame(frames[second]), log.camera, as_range=as_range)
-            if move.T_first_second is not None:
-                break
+        frame, next_frame = log.frame(frames[first]), log.frame(frames[first + 1])
+        move = _move(frame, next_frame, log.camera, as_range=as_range)
+        if near > first + 1:
+            farther = log.frame(frames[near])
+            T_guess = _extrapolated(move, farther.stamp_ns)
+            moved = _move(frame, farther, log.camera, as_range=as_range, T_guess=T_guess)
+            move = move if moved.T_first_second is None else moved
         found.append(move)
     return found
+
+
+def _extrapolated(move: Move, to_ns: int) -> Array:
+    """Where a camera would be that goes on as it moved: a plane with little texture has many minima farther away."""
+    if move.T_first_second is None:
+        return np.eye(4)
+    times = (to_ns - move.first_ns) / (move.second_ns - move.first_ns)
+    return se3.exp(times * se3.log(move.T_first_second))
 
 
 def _with_depth_of_their_own(log: RgbdLog) -> list[int]:
@@ -91,9 +101,17 @@ def _with_depth_of_their_own(log: RgbdLog) -> list[int]:
     return sorted(index for _, index in nearest.values())
 
 
-def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera, *, as_range: bool) -> Move:
+def _move(
+    first: RgbdFrame,
+    second: RgbdFrame,
+    camera: PinholeCamera,
+    *,
+    as_range: bool,
+    T_guess: Array | None = None,
+) -> Move:
+    T_guess = np.eye(4) if T_guess is None else T_guess
     depths = first.usable_depth, second.usable_depth
-    result = _registered(first, second, depths, camera)
+    result = _registered(first, second, depths, camera, T_guess=T_guess)
     if not result.ok:
         return Move(first.stamp_ns, second.stamp_ns, None)
     T, depth_m = result.T_reference_target, depths[0]
@@ -107,22 +125,27 @@ def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera, *, as_rang
         depth_m=float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0,
         depth_rms_m=result.rms_depth_m,
         depth_offset_ns=max(abs(first.depth_offset_ns), abs(second.depth_offset_ns)),
-        residual_as_range=_residual_as_range(first, second, camera) if as_range else np.nan,
+        residual_as_range=_residual_as_range(first, second, camera, T_guess) if as_range else np.nan,
     )
 
 
-def _residual_as_range(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> float:
+def _residual_as_range(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera, T_guess: Array) -> float:
     """`Move.residual` if depth were the distance along the ray; NaN if that does not register."""
     lengths = camera.ray_lengths().astype(np.float32)
     along_z = first.usable_depth / lengths, second.usable_depth / lengths
-    result = _registered(first, second, along_z, camera)
+    result = _registered(first, second, along_z, camera, T_guess=T_guess)
     return _moved(*along_z, result.T_reference_target, camera) if result.ok else np.nan
 
 
 def _registered(
-    first: RgbdFrame, second: RgbdFrame, depths: tuple[Image, Image], camera: PinholeCamera
+    first: RgbdFrame,
+    second: RgbdFrame,
+    depths: tuple[Image, Image],
+    camera: PinholeCamera,
+    *,
+    T_guess: Array,
 ) -> Registration:
-    """The registration of two frames with some depth [h, w] of both, meters along z."""
+    """The registration of two frames with some depth [h, w] of both, meters along z, from a motion [4, 4]."""
     a, b = (
         RgbdPyramid.build(
             frame.color.astype(np.float32) / 255,
@@ -133,7 +156,7 @@ def _registered(
         )
         for frame, depth_m in zip((first, second), depths, strict=True)
     )
-    return register(Reference.from_pyramid(a), b, np.eye(4))
+    return register(Reference.from_pyramid(a), b, T_guess)
 
 
 def _length_sigma_m(result: Registration) -> float:
