@@ -17,6 +17,8 @@ With exact cameras they are 0.15 to 0.65 px apart, with those that datasets stat
 FEWEST_PAIRS = 10
 CERTAIN_SIGMAS = 4.0
 """Scales of depth that differ by more standard deviations are said to."""
+APART_OF_OWN, APART_M = 10.0, 0.1
+"""A team's error beyond this many times its robots' own errors, and this, is not one of tracking."""
 
 
 def advice(run: RunFolder, source: Recording, session: Session) -> list[str]:
@@ -27,7 +29,12 @@ def advice(run: RunFolder, source: Recording, session: Session) -> list[str]:
         source: its recording.
         session: the exchange of the run.
     """
-    said = calibration_advice(run, source), depth_scale_advice(run), moved_advice(session)
+    said = (
+        calibration_advice(run, source),
+        depth_scale_advice(run),
+        moved_advice(session),
+        truth_advice(run),
+    )
     return [sentence for sentence in said if sentence]
 
 
@@ -92,6 +99,29 @@ def moved_advice(session: Session) -> str:
     return (
         f"Something moved between the views of {pairs} and stands in their maps where each saw it; "
         "loop closures that follow it, so many, are left out."
+    )
+
+
+def truth_advice(run: RunFolder) -> str:
+    """A sentence that says so where robots agree with the ground truth each by itself, and not together.
+
+    Args:
+        run: that was measured.
+    """
+    errors = {
+        name: (robot["ate_rmse_m"], robot["ate_rmse_m_joint"])
+        for name, robot in run.metrics["robots"].items()
+        if robot.get("ate_rmse_m") is not None and robot.get("ate_rmse_m_joint") is not None
+    }
+    if not errors:
+        return ""
+    own_m, joint_m = (max(values) for values in zip(*errors.values(), strict=True))
+    if joint_m <= max(APART_M, APART_OF_OWN * own_m):
+        return ""
+    return (
+        f"{' and '.join(errors)} agree with the ground truth to {1000 * own_m:.0f} mm each by itself, and to "
+        f"{joint_m:.2f} m together: they were joined by what only looks alike, or their ground truths are in "
+        "different frames."
     )
 
 

@@ -9,7 +9,13 @@ import pytest
 
 from duagc.pipeline.exchange.verification import Verdict
 from duagc.pipeline.report import advice
-from duagc.pipeline.report.advice import FEWEST_PAIRS, calibration_advice, depth_scale_advice, moved_advice
+from duagc.pipeline.report.advice import (
+    FEWEST_PAIRS,
+    calibration_advice,
+    depth_scale_advice,
+    moved_advice,
+    truth_advice,
+)
 
 
 def run_of(calibration: tuple[str, ...] = (), pairs: int = 40, **off_px: float | None) -> Any:
@@ -65,6 +71,26 @@ def test_robots_whose_depth_is_longer_are_named() -> None:
     assert "alpha" not in said
     assert "charlie" not in said
     assert depth_scale_advice(SimpleNamespace(metrics={"robots": {"alpha": {}}})) == ""
+
+
+@pytest.mark.parametrize(
+    ("own_m", "joint_m", "said"),
+    [
+        (
+            0.001,
+            1.376,
+            "alpha and bravo agree with the ground truth to 1 mm each by itself, and to 1.38 m together",
+        ),
+        (0.001, 0.09, ""),
+        (0.2, 0.5, ""),
+        (None, None, ""),
+    ],
+)
+def test_truth_that_fits_each_robot_and_not_the_team_is_said(own_m: Any, joint_m: Any, said: str) -> None:
+    errors = {"ate_rmse_m": own_m, "ate_rmse_m_joint": joint_m}
+    run = SimpleNamespace(metrics={"robots": {"alpha": errors, "bravo": errors, "charlie": {}}})
+    assert truth_advice(run).startswith(said)
+    assert bool(truth_advice(run)) == bool(said)
 
 
 def test_robots_between_whose_views_something_moved_are_named() -> None:
