@@ -371,6 +371,8 @@ def comparison_text(metrics: Mapping[str, Any]) -> str:
     }
     short = {"held_out": "own", "peers": "peers", "team": "team"}
     sets, columns = compared_sets(metrics), comparison_columns(metrics)
+    if not sets:
+        return "no map was compared: no frame was held out, and no two robots met"
     width = max(8 * len(sets), 15)
     cell = width // max(len(sets), 1)
     lines = [" " * 24 + "".join(heads[column].rjust(width) for column in columns)]

@@ -185,6 +185,17 @@ def test_the_charts_name_what_they_show(html):
         assert any(expected in chart for chart in charts), expected
 
 
+def test_maps_that_no_view_compares_are_said_to_be_none(fake):
+    metrics = json.loads((fake.run / "metrics.json").read_text())
+    for kind in labels.COMPARED:
+        for found in metrics["rendering"][kind].values():
+            found["views"] = 0
+    metrics["rendering"]["own"]["training"] = {"views": 2}
+    assert labels.comparison_text(metrics) == (
+        "no map was compared: no frame was held out, and no two robots met"
+    )
+
+
 def test_a_run_of_one_robot_shows_no_columns_of_dashes(tmp_path):
     fake = make(tmp_path, joined=False)
     metrics = evaluate(fake.run, fake.recording, progress=False)
