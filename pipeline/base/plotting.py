@@ -42,7 +42,7 @@ def style(settings: Mapping[str, Any]) -> Iterator[None]:
 
 
 def _usual_folder() -> Path:
-    """Where matplotlib keeps what it knows, unless it is told otherwise."""
+    """Where matplotlib keeps what it knows, unless said otherwise."""
     base = os.environ.get("XDG_CONFIG_HOME")
     return (Path(base) if base else Path("~/.config").expanduser()) / "matplotlib"
 

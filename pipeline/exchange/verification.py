@@ -38,6 +38,7 @@ class Verdict(Enum):
     FEW_MATCHES = "too few matches between all features of the two keyframes"
     FEW_INLIERS = "too few matches agree on one motion"
     NOT_REGISTERED = "registration of the two views failed"
+    LOOKS_DIFFERENT = "what both views see looks different"
     MOVED = "registration moved far from the motion of the matches"
     SOMETHING_MOVED = "shows something that moved between the recordings"
     OUTWEIGHED = "lost its weight in the pose consensus"
@@ -199,6 +200,7 @@ _VERDICTS = {
     Failure.FEW_INLIERS: Verdict.FEW_INLIERS,
     Failure.NOT_REGISTERED: Verdict.NOT_REGISTERED,
     Failure.LOW_OVERLAP: Verdict.NOT_REGISTERED,
+    Failure.LOOKS_DIFFERENT: Verdict.LOOKS_DIFFERENT,
     Failure.DIRECTIONS_DISAGREE: Verdict.NOT_REGISTERED,
     Failure.FAR_FROM_FEATURES: Verdict.MOVED,
 }
@@ -216,6 +218,8 @@ def _detail(found: GeometricVerification) -> str:
         return f"registration: {result.outcome.value}"
     if found.failure is Failure.FAR_FROM_FEATURES:
         return f"by {found.correction_m:.3f} m and {found.correction_rad:.3f} rad"
+    if found.failure is Failure.LOOKS_DIFFERENT:
+        return f"{found.alike:.0%} of the common texture look alike"
     if found.failure is not None:
         return f"registration: {found.failure.value}"
     return f"refined by {found.correction_m:.4f} m, {found.correction_rad:.4f} rad"

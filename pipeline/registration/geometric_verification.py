@@ -24,6 +24,7 @@ from duagc.pipeline.registration.feature_motion import (
     motion_of_points,
 )
 from duagc.pipeline.registration.features import Features
+from duagc.pipeline.registration.image_agreement import share_alike
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.rectified_features import matched_points
 from duagc.pipeline.registration.reference import Reference
@@ -36,6 +37,7 @@ class Failure(Enum):
     FEW_INLIERS = "few_inliers"
     NOT_REGISTERED = "not_registered"
     LOW_OVERLAP = "low_overlap"
+    LOOKS_DIFFERENT = "looks_different"
     DIRECTIONS_DISAGREE = "directions_disagree"
     FAR_FROM_FEATURES = "far_from_features"
 
@@ -78,6 +80,7 @@ class GeometricVerification:
             whichever is less; 0 before it.
         correction_rad: the same for the rotation.
         another: of the other motion, if features agree on two.
+        alike: share of the texture that both views see that looks alike, where that is too little.
     """
 
     failure: Failure | None
@@ -88,6 +91,7 @@ class GeometricVerification:
     correction_m: float = 0.0
     correction_rad: float = 0.0
     another: GeometricVerification | None = None
+    alike: float = 1.0
 
     @property
     def of_place(self) -> GeometricVerification:
@@ -167,6 +171,8 @@ def _verified(
             return failed(Failure.NOT_REGISTERED, one.result)
     if not all(one.shares_enough for one in measured):
         return failed(Failure.LOW_OVERLAP, result)
+    if (alike := min(one.alike for one in measured)) < config.min_alike:
+        return replace(failed(Failure.LOOKS_DIFFERENT, result), alike=alike)
     apart_m, apart_rad = se3.distance(T, measured[-1].T_first_second)
     reach = reach_factor(max(view.median_depth_m for view in views))
     if apart_m > config.max_disagreement_m * reach or apart_rad > config.max_disagreement_rad:
@@ -190,12 +196,14 @@ class _Measured:
         T_first_second: [4, 4], by it.
         information: [6, 6] of the right tangent of T_first_second.
         shares_enough: whether the views share enough there.
+        alike: share of the texture that both see that looks alike there.
     """
 
     result: Registration
     T_first_second: Array
     information: Array
     shares_enough: bool
+    alike: float
 
 
 def _registered(
@@ -212,14 +220,17 @@ def _registered(
         target = second.images()
         forward = register(first.reference, target, T_first_second, registration)
         enough = _shares_enough(forward, first.reference, target, config)
-        measured.append(_Measured(forward, forward.T_reference_target, forward.information, enough))
+        T = forward.T_reference_target
+        alike = share_alike(first.reference, target, T)
+        measured.append(_Measured(forward, T, forward.information, enough, alike))
     if second.reference is not None and first.images is not None:
         target = first.images()
         backward = register(second.reference, target, se3.inverse(T_first_second), registration)
         enough = _shares_enough(backward, second.reference, target, config)
         T_second_first = backward.T_reference_target
         information = se3.inverse_information(T_second_first, backward.information)
-        measured.append(_Measured(backward, se3.inverse(T_second_first), information, enough))
+        alike = share_alike(second.reference, target, T_second_first)
+        measured.append(_Measured(backward, se3.inverse(T_second_first), information, enough, alike))
     return measured
 
 

@@ -107,7 +107,7 @@ class Reference:
         levels = [samples]
         for index, level in enumerate(pyramid.levels[1:], start=1):
             scale = 2.0**index
-            gray = _bilinear(level.gray, (u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5)
+            gray = bilinear(level.gray, (u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5)
             levels.append(ReferenceLevel(samples.points, samples.normals, gray, samples.depth_sigmas))
         return Reference(tuple(levels))
 
@@ -174,8 +174,14 @@ def _centers_of_tiles(known: NDArray[np.bool_], count: int) -> NDArray[np.int64]
     return index[tiles, best][values[tiles, best] >= 0]
 
 
-def _bilinear(image: Samples, u: NDArray[np.float64], v: NDArray[np.float64]) -> Samples:
-    """Image [h, w] at pixels (u, v), clamped to the border."""
+def bilinear(image: Samples, u: NDArray[np.float64], v: NDArray[np.float64]) -> Samples:
+    """Image at pixels between its own, clamped to the border.
+
+    Args:
+        image: [h, w].
+        u: columns [n].
+        v: rows [n].
+    """
     h, w = image.shape
     u, v = np.clip(u, 0, w - 1), np.clip(v, 0, h - 1)
     u0, v0 = np.minimum(u.astype(np.int64), w - 2), np.minimum(v.astype(np.int64), h - 2)

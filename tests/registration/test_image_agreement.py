@@ -1,0 +1,87 @@
+"""Views that registration laid onto each other must look alike where both have texture."""
+
+import cv2
+import numpy as np
+import pytest
+
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.registration import Reference, RgbdPyramid
+from duagc.pipeline.registration.features import extract
+from duagc.pipeline.registration.geometric_verification import Failure, VerificationView, verify
+from duagc.pipeline.registration.image_agreement import share_alike
+
+MIN_ALIKE = GeometricVerificationConfig().min_alike
+CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 159.5, 119.5)
+POSTER = np.s_[70:170, 110:210]
+
+
+def wall(seed: int, contrast: float = 0.2) -> np.ndarray:
+    """Gray values [h, w] of a wall, another one for each seed."""
+    noise = np.random.default_rng(seed).standard_normal((240, 320)).astype(np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), 4))
+    return np.clip(0.5 + contrast * smooth / smooth.std(), 0, 1).astype(np.float32)
+
+
+def view(gray: np.ndarray) -> RgbdPyramid:
+    return RgbdPyramid.build(gray, np.full(gray.shape, 2.0, np.float32), CAMERA)
+
+
+def share(gray: np.ndarray, other: np.ndarray) -> float:
+    return share_alike(Reference.sample(view(gray)), view(other), np.eye(4))
+
+
+def test_a_place_looks_like_itself_in_any_light() -> None:
+    noise = 0.02 * np.random.default_rng(9).standard_normal((240, 320)).astype(np.float32)
+    assert share(wall(1), wall(1)) == 1.0
+    assert share(wall(1), 0.4 * wall(1) + 0.3 + noise) > 0.95
+
+
+def test_a_poster_on_another_wall_is_another_place() -> None:
+    one, other = wall(1), wall(2)
+    one[POSTER] = other[POSTER] = wall(3)[POSTER]
+    assert share(one, other) < MIN_ALIKE
+
+
+def test_a_poster_on_another_wall_is_not_verified() -> None:
+    one, other = wall(1, contrast=0.05), wall(2, contrast=0.05)
+    one[POSTER] = other[POSTER] = wall(3)[POSTER]
+
+    def failure(first: np.ndarray, second: np.ndarray) -> Failure | None:
+        rng = random_streams.generator(0, "ransac")
+        settings = GeometricVerificationConfig(), RegistrationConfig()
+        return verify(seen(first), seen(second), settings[0], registration=settings[1], rng=rng).failure
+
+    def seen(gray: np.ndarray) -> VerificationView:
+        pyramid = view(gray)
+        color = np.repeat((255 * gray).astype(np.uint8)[..., None], 3, axis=2)
+        features = extract(color, np.full(gray.shape, 2.0, np.float32), CAMERA, 400)
+        return VerificationView(features, Reference.sample(pyramid), lambda: pyramid)
+
+    assert failure(one, one) is None
+    assert failure(one, other) is Failure.LOOKS_DIFFERENT
+
+
+def test_a_place_where_less_than_half_changed_looks_like_itself() -> None:
+    changed = wall(1)
+    changed[:, :100] = wall(2)[:, :100]
+    assert MIN_ALIKE < share(wall(1), changed) < 0.8
+
+
+def test_without_texture_nothing_is_decided() -> None:
+    assert share(wall(1, contrast=0.001), wall(2, contrast=0.001)) == 1.0
+    away = se3.exp(np.array([50.0, 0, 0, 0, 0, 0]))
+    assert share_alike(Reference.sample(view(wall(1))), view(wall(1)), away) == 1.0
+
+
+@pytest.mark.parametrize("textured_first", [True, False])
+def test_texture_that_one_view_alone_shows_is_a_difference(textured_first: bool) -> None:
+    views = (wall(1), wall(2, contrast=0.001))
+    assert share(*views if textured_first else views[::-1]) < 0.1
+
+
+def test_without_depth_gray_values_are_compared() -> None:
+    reference = Reference.sample(view(wall(1)))
+    assert share_alike(reference, view(wall(1)).without_depth(), np.eye(4)) == 1.0
