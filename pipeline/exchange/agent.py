@@ -3,7 +3,7 @@
     loop closing    protocols with every neighbor                             loop_closing.py
     alignment       relative frames of all pairs, flooded; agents that know the same pairs place the team alike
                                                                               map_alignment.py, frame_flooding.py
-    poses           rounds of a solver until all robots have converged        solvers.py
+    poses           rounds of a solver until all robots have converged        solvers.py, pose_solver.py
     sharing         evidence of every robot to every robot, agreed poses; the lower-named robot of a pair matches
                     Gaussians and floods the matches                          sharing.py, knowledge.py
 
@@ -39,9 +39,10 @@ from duagc.pipeline.exchange.loop_closing import LoopClosing
 from duagc.pipeline.exchange.map_alignment import MapAlignment
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.own_graph import OwnGraph
+from duagc.pipeline.exchange.pose_solver import LinkStart, PoseSolver, SolverFactory, SolverStart
 from duagc.pipeline.exchange.radio import LOOP_CLOSING_KINDS, Radio
 from duagc.pipeline.exchange.shared_data import SharedData
-from duagc.pipeline.exchange.solvers import LinkStart, PoseSolver, SolverFactory, SolverStart, solver_of
+from duagc.pipeline.exchange.solvers import solver_of
 from duagc.pipeline.exchange.wire import state_wire
 from duagc.pipeline.exchange.wire.state_wire import State, pair_bit
 from duagc.pipeline.geometry import se3

@@ -33,7 +33,7 @@ from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import PosePacket, rounded
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.exchange.matched_pairs import MatchedPairs, moved
-from duagc.pipeline.exchange.solvers import LinkStart, Matcher, SolverStart
+from duagc.pipeline.exchange.pose_solver import LinkStart, Matcher, SolverStart
 from duagc.pipeline.exchange.wire.algorithm_1_wire import read_means, read_pairs, write_means, write_pairs
 from duagc.pipeline.exchange.wire.link_setup_wire import LinkSetup, read_setup, write_setup
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts

@@ -10,8 +10,8 @@ from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.exchange.map_alignment import MapAlignment
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.own_graph import OwnGraph
+from duagc.pipeline.exchange.pose_solver import LinkStart
 from duagc.pipeline.exchange.radio import Radio
-from duagc.pipeline.exchange.solvers import LinkStart
 from duagc.pipeline.posegraph.loop_closures import plausible
 
 

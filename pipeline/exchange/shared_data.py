@@ -8,7 +8,7 @@ from typing import Protocol
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.exchange.knowledge import Knowledge
 from duagc.pipeline.exchange.neighbor import Neighbor
-from duagc.pipeline.exchange.solvers import Matcher
+from duagc.pipeline.exchange.pose_solver import Matcher
 from duagc.pipeline.exchange.wire.state_wire import State
 from duagc.pipeline.network.messages import Arrival
 from duagc.pipeline.network.packets import Kind, MalformedError

@@ -28,8 +28,8 @@ from duagc.pipeline.exchange.evidence_records import (
 )
 from duagc.pipeline.exchange.knowledge import Knowledge
 from duagc.pipeline.exchange.neighbor import Neighbor
+from duagc.pipeline.exchange.pose_solver import Matcher
 from duagc.pipeline.exchange.shared_data import SendTo
-from duagc.pipeline.exchange.solvers import Matcher
 from duagc.pipeline.exchange.wire import anchors_wire, evidence_wire, state_wire
 from duagc.pipeline.exchange.wire.anchors_wire import Anchors, PlacedKeyframes
 from duagc.pipeline.exchange.wire.state_wire import PairList, State

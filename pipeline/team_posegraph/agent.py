@@ -12,10 +12,11 @@ from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.elimination_solver import EliminationSolver
 from duagc.pipeline.exchange.known_loop_closures import KnownLoopClosures, KnownPair
 from duagc.pipeline.exchange.own_graph import OwnGraph
+from duagc.pipeline.exchange.pose_solver import LinkStart, PoseSolver, SolverStart
 from duagc.pipeline.exchange.shared_data import NoSharing
-from duagc.pipeline.exchange.solvers import EliminationSolver, LinkStart, PoseSolver, SolverStart
 from duagc.pipeline.posegraph.files import RobotGraph
 from duagc.pipeline.posegraph.initialization import own_start
 from duagc.pipeline.posegraph.loop_closures import drift

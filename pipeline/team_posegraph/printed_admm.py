@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.consensus.admm_edge import PosePacket
-from duagc.pipeline.exchange.solvers import LinkStart, SolverStart
+from duagc.pipeline.exchange.pose_solver import LinkStart, SolverStart
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph import least_squares

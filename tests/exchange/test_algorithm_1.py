@@ -121,7 +121,7 @@ def test_messages_are_read_as_they_were_written() -> None:
 
 def test_without_gaussians_there_is_nothing_to_solve(team: dict[str, Any]) -> None:
     from duagc.pipeline.consensus.tree import TreePlace
-    from duagc.pipeline.exchange.solvers import SolverStart
+    from duagc.pipeline.exchange.pose_solver import SolverStart
 
     agent = after(team, "admm", 1)
     start = SolverStart(agent.graph, 0, np.eye(4), TreePlace.of(0, {0: None}), [])

@@ -17,9 +17,9 @@ from duagc.pipeline.consensus.tree import TreePlace
 from duagc.pipeline.exchange import elected
 from duagc.pipeline.exchange.elected import ElectedSolver, solve_for_all
 from duagc.pipeline.exchange.own_graph import OwnGraph
+from duagc.pipeline.exchange.pose_solver import LinkStart, SolverStart
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of
-from duagc.pipeline.exchange.solvers import LinkStart, SolverStart
 from duagc.pipeline.exchange.wire.elected_wire import (
     AnswerPart,
     GraphPart,
