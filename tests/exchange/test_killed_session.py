@@ -11,14 +11,14 @@ import pytest
 from duagc.pipeline.base import recall
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.config.exchange import ExchangeConfig
-from duagc.pipeline.exchange import detected_loop_closures, keyframe_database, sharing
+from duagc.pipeline.exchange import keyframe_database, loop_closure_verifier, sharing
 from duagc.pipeline.exchange.rectified_search import RectifiedSearch
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.recording import content_digest
 
 SLOW: dict[Any, tuple[str, ...]] = {
     keyframe_database: ("extract", "extract_rectified"),
-    detected_loop_closures: ("verify",),
+    loop_closure_verifier: ("verify",),
     RectifiedSearch: ("compare",),
     sharing: ("own_records", "match_pairs"),
 }

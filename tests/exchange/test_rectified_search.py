@@ -10,8 +10,9 @@ import pytest
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.exchange import ExchangeConfig, PlacesConfig
-from duagc.pipeline.exchange.detected_loop_closures import Provider, Verifier
+from duagc.pipeline.exchange.detected_loop_closures import Provider
 from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
+from duagc.pipeline.exchange.loop_closure_verifier import Verifier
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.rectified_search import most_alike
 from duagc.pipeline.exchange.wire.loop_closing_wire import (

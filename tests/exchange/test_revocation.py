@@ -13,7 +13,7 @@ import pytest
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig
-from duagc.pipeline.exchange.detected_loop_closures import Verifier
+from duagc.pipeline.exchange.loop_closure_verifier import Verifier
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of

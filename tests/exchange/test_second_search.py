@@ -8,9 +8,10 @@ import pytest
 
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.exchange import ExchangeConfig, PlacesConfig
-from duagc.pipeline.exchange import detected_loop_closures
-from duagc.pipeline.exchange.detected_loop_closures import Provider, Verifier
+from duagc.pipeline.exchange import loop_closure_verifier
+from duagc.pipeline.exchange.detected_loop_closures import Provider
 from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
+from duagc.pipeline.exchange.loop_closure_verifier import Verifier
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.exchange.view_overlap import ALONG_PATH, overlaps, shared_view
@@ -136,5 +137,5 @@ def test_a_pair_that_registration_rejects_leads_to_others(
         guess = replace(result.closure, information=np.zeros((6, 6)))
         return replace(result, verdict=Verdict.MOVED, closure=None, tentative=guess)
 
-    monkeypatch.setattr(detected_loop_closures, "verify", rejects_the_first)
+    monkeypatch.setattr(loop_closure_verifier, "verify", rejects_the_first)
     assert search(robots, MIN_SCORE)[0].joined is not None
