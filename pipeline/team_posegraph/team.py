@@ -9,7 +9,8 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.exchange.rounds import run_rounds
-from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, MAX_TEAM
+from duagc.pipeline.exchange.wire.reader import MAX_COORDINATE
+from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM
 from duagc.pipeline.network.link_model import Fate, LinkModel
 from duagc.pipeline.network.messages import Outgoing
 from duagc.pipeline.network.packets import MalformedError

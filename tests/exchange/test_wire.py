@@ -15,6 +15,7 @@ from duagc.pipeline.consensus.admm_edge import PosePacket, SharedKeyframes
 from duagc.pipeline.exchange.wire import anchors_wire, evidence_wire, loop_closing_wire, state_wire
 from duagc.pipeline.exchange.wire.camera_wire import camera_bytes, read_camera
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses
+from duagc.pipeline.exchange.wire.reader import Reader
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.network.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
@@ -192,7 +193,7 @@ def test_final_poses_and_voxels_come_back_bit_for_bit() -> None:
 def test_an_impossible_camera_is_refused(field: str, value: float) -> None:
     data = camera_bytes(replace(CAMERA, **{field: value}))
     with pytest.raises(MalformedError, match="impossible camera"):
-        read_camera(state_wire.Reader(data, "anchors"))
+        read_camera(Reader(data, "anchors"))
 
 
 def test_a_sample_comes_back_within_its_quantization() -> None:
@@ -329,7 +330,7 @@ def test_announced_poses_cost_no_memory_before_they_are_there() -> None:
     tracemalloc.start()
     try:
         with pytest.raises(MalformedError, match="more were announced"):
-            state_wire.Reader(bytes(96), "poses").poses(10**6)
+            Reader(bytes(96), "poses").poses(10**6)
         assert tracemalloc.get_traced_memory()[1] < 10**6
     finally:
         tracemalloc.stop()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array, array_bytes
-from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
+from duagc.pipeline.exchange.wire.reader import MAX_COORDINATE, Reader
 from duagc.pipeline.network.packets import MalformedError
 
 _COUNT = struct.Struct("<I")

@@ -1,4 +1,4 @@
-"""Bytes of the poses of one robot's keyframes, to which its evidence is anchored. Strict as `state_wire`."""
+"""Bytes of the poses of one robot's keyframes, to which its evidence is anchored. Strict as `reader`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.exchange.wire.camera_wire import camera_bytes, read_camera
-from duagc.pipeline.exchange.wire.state_wire import MAX_KEYFRAMES, Reader, pose_bytes
+from duagc.pipeline.exchange.wire.reader import MAX_KEYFRAMES, Reader, pose_bytes
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.network.packets import MalformedError
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from duagc.pipeline.base.arrays import Array, array_bytes
 from duagc.pipeline.exchange.wire.link_setup_wire import LinkSetup, read_setup, write_setup
-from duagc.pipeline.exchange.wire.state_wire import Reader
+from duagc.pipeline.exchange.wire.reader import Reader
 from duagc.pipeline.network.packets import MalformedError
 
 _SETUP, _WEIGHTS = b"\0", b"\1"

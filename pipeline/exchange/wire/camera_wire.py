@@ -1,11 +1,11 @@
-"""Bytes of a camera: others need it to know what a keyframe sees, and how finely. Strict as `state_wire`."""
+"""Bytes of a camera: others need it to know what a keyframe sees, and how finely. Strict as `reader`."""
 
 from __future__ import annotations
 
 import math
 import struct
 
-from duagc.pipeline.exchange.wire.state_wire import Reader
+from duagc.pipeline.exchange.wire.reader import Reader
 from duagc.pipeline.geometry.camera import MAX_SIDE_PX, PinholeCamera
 from duagc.pipeline.network.packets import MalformedError
 

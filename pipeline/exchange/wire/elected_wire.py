@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array, array_bytes
-from duagc.pipeline.exchange.wire.state_wire import Reader, pose_bytes
+from duagc.pipeline.exchange.wire.reader import Reader, pose_bytes
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
 

@@ -11,7 +11,8 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array, array_bytes
 from duagc.pipeline.consensus.elimination import BackSubstitution, Block, Variable
 from duagc.pipeline.consensus.tree import Message, TreeNode
-from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM, Reader
+from duagc.pipeline.exchange.wire.reader import Reader
+from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM
 from duagc.pipeline.network.packets import MalformedError
 
 

@@ -13,7 +13,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.row_blocks import in_blocks
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.exchange.wire.compact_wire import COMPACT, decode, encode
-from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, MAX_INFORMATION, Reader
+from duagc.pipeline.exchange.wire.reader import MAX_COORDINATE, MAX_INFORMATION, Reader
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.network.packets import (
     EVIDENCE_BYTES,

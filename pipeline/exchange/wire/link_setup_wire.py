@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array, array_bytes
-from duagc.pipeline.exchange.wire.state_wire import MAX_INFORMATION, MAX_KEYFRAMES, Reader, pose_bytes
+from duagc.pipeline.exchange.wire.reader import MAX_INFORMATION, MAX_KEYFRAMES, Reader, pose_bytes
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 

@@ -1,4 +1,4 @@
-"""Bytes of loop closing: descriptors, samples of keyframes, the verdict, named keyframes. Strict as `state_wire`."""
+"""Bytes of loop closing: descriptors, samples of keyframes, the verdict, named keyframes. Strict as `reader`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array, array_bytes
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.exchange.wire.camera_wire import camera_bytes, read_camera
-from duagc.pipeline.exchange.wire.state_wire import (
-    MAX_KEYFRAMES,
-    Reader,
-    motion_bytes,
-    pose_bytes,
-)
+from duagc.pipeline.exchange.wire.reader import MAX_KEYFRAMES, Reader, motion_bytes, pose_bytes
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.registration import Reference, ReferenceLevel

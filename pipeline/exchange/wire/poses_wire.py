@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import array_bytes
 from duagc.pipeline.consensus.admm_edge import STEP_M, PosePacket
-from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
+from duagc.pipeline.exchange.wire.reader import MAX_COORDINATE, Reader
 from duagc.pipeline.network.packets import MalformedError
 
 _POSES = struct.Struct("<IIBHH2f")
