@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.network import TransportConfig
+from duagc.pipeline.network.chunks import ChunkNews, OpenMessage, PartialMessage, priority
 from duagc.pipeline.network.congestion import FULL_ROUNDS, MOST_ROUNDS, Congestion, LinkObserver, SendRate
 from duagc.pipeline.network.messages import Arrival, Message, Outgoing
 from duagc.pipeline.network.packets import (
@@ -42,43 +42,6 @@ LAST_CHUNKS = 3
 LOSSY = 0.97  # share of packets heard below which a link loses some
 SEQUENCE_BLOCK = 1024
 ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
-
-
-@dataclass
-class _Open:
-    """An outgoing message: which chunks are acknowledged, and from which round each may be sent (again); at first 0."""
-
-    message: Message
-    acknowledged: NDArray[np.bool_]
-    due_round: NDArray[np.int64]
-
-    def size(self, chunk: int) -> int:
-        """Bytes of a chunk, headers left out."""
-        whole = chunk_bytes(self.message.kind)
-        return min(whole, len(self.message.payload) - chunk * whole)
-
-
-@dataclass
-class _Partial:
-    """An incoming message: its chunks so far."""
-
-    kind: Kind
-    total: int
-    chunks: dict[int, bytes] = field(default_factory=dict)
-
-
-@dataclass
-class _News:
-    """Chunks of one message to acknowledge: from `first` to `last`, up to and including a round."""
-
-    first: int
-    last: int
-    until_round: int
-
-
-def _priority(entry: _Open) -> tuple[bool, int, int]:
-    """Evidence last, else by kind, then in the order of sending."""
-    return entry.message.kind in EVIDENCE_KINDS, entry.message.kind, entry.message.id
 
 
 class Transport:
@@ -110,10 +73,10 @@ class Transport:
         self._overhead_bytes = HEADER_BYTES + (0 if identity is None else SIGNATURE_BYTES)
         self.sequence = 0
         self.last_heard: int | None = None
-        self._open: dict[int, _Open] = {}
-        self._partial: dict[int, _Partial] = {}
+        self._open: dict[int, OpenMessage] = {}
+        self._partial: dict[int, PartialMessage] = {}
         self._received: dict[int, tuple[Kind, int]] = {}  # complete messages: kind, total bytes
-        self._to_acknowledge: dict[int, _News] = {}
+        self._to_acknowledge: dict[int, ChunkNews] = {}
         self._packets_heard = self._highest_sequence = 0
         self._heard: dict[int, int] = {}  # sequence numbers, a mask for each block of SEQUENCE_BLOCK
         self._observer = LinkObserver()
@@ -122,15 +85,23 @@ class Transport:
     # --- outgoing
 
     def send(self, message: Message) -> None:
-        """Queue a reliable message of at most `max_message_bytes`."""
+        """Queue a reliable message of at most `max_message_bytes`.
+
+        Args:
+            message: for the neighbor.
+        """
         size, most = len(message.payload), self.config.max_message_bytes
         if size > most:  # every neighbor refuses it
             raise DuagError(f"exchange.transport.max_message_bytes is {most}, expected at least {size}")
         n = chunk_count(message.kind, size)
-        self._open[message.id] = _Open(message, np.zeros(n, bool), np.zeros(n, np.int64))
+        self._open[message.id] = OpenMessage(message, np.zeros(n, bool), np.zeros(n, np.int64))
 
     def cancel(self, message: int) -> None:
-        """Stop sending a message, if it is still open."""
+        """Stop sending a message, if it is still open.
+
+        Args:
+            message: its id.
+        """
         self._open.pop(message, None)
 
     def cancel_all(self) -> None:
@@ -138,7 +109,11 @@ class Transport:
         self._open.clear()
 
     def is_open(self, message: int) -> bool:
-        """Whether a message is not yet fully acknowledged."""
+        """Whether a message is not yet fully acknowledged.
+
+        Args:
+            message: its id.
+        """
         return message in self._open
 
     @property
@@ -152,7 +127,11 @@ class Transport:
         return not self._open
 
     def in_contact(self, round_index: int) -> bool:
-        """Whether the neighbor was heard lately."""
+        """Whether the neighbor was heard lately.
+
+        Args:
+            round_index: the current round.
+        """
         return (
             self.last_heard is not None
             and round_index - self.last_heard <= self.config.contact_lost_after_rounds
@@ -214,7 +193,7 @@ class Transport:
         """Rounds there and back when nothing waits, with room for the two ends."""
         return 2 * (self._observer.least_delay or 0) + 2
 
-    def _due(self, round_index: int) -> Iterator[tuple[_Open, int]]:
+    def _due(self, round_index: int) -> Iterator[tuple[OpenMessage, int]]:
         """Chunks to send, in order; overdue ones later if acknowledgements have to wait.
 
         Where packets are lost, the last chunks of a message that is no evidence go in every round: while the neighbor
@@ -222,7 +201,7 @@ class Transport:
         """
         waits = self._observer.excess_rounds(round_index)
         repeats = self._share_heard < LOSSY and waits + self._rate.queued_rounds < FULL_ROUNDS
-        for entry in sorted(self._open.values(), key=_priority):
+        for entry in sorted(self._open.values(), key=priority):
             late = np.where(entry.due_round > 0, waits, 0)
             missing = ~entry.acknowledged
             last = missing.sum() <= LAST_CHUNKS and entry.message.kind not in EVIDENCE_KINDS
@@ -341,8 +320,8 @@ class Transport:
                 )
             if len(self._partial) >= self.config.max_open_messages:
                 raise MalformedError(f"more than {self.config.max_open_messages} incomplete messages")
-            partial = self._partial[packet.message] = _Partial(packet.kind, packet.total)
-        news = self._to_acknowledge.setdefault(packet.message, _News(chunk, chunk, 0))
+            partial = self._partial[packet.message] = PartialMessage(packet.kind, packet.total)
+        news = self._to_acknowledge.setdefault(packet.message, ChunkNews(chunk, chunk, 0))
         news.first, news.last = min(news.first, chunk), max(news.last, chunk)
         news.until_round = round_index + self._repeats()
         if partial is None or chunk in partial.chunks:
@@ -361,12 +340,17 @@ class Transport:
         return None
 
     def accept_rest(self, message: int, round_index: int) -> None:
-        """Acknowledge all of a message that is not needed any more: its content is here already."""
+        """Acknowledge all of a message that is not needed any more: its content is here already.
+
+        Args:
+            message: its id.
+            round_index: the current round.
+        """
         partial = self._partial.pop(message, None)
         if partial is not None:
             self._received[message] = (partial.kind, partial.total)
             last = chunk_count(partial.kind, partial.total) - 1
-            self._to_acknowledge[message] = _News(0, last, round_index + self._repeats())
+            self._to_acknowledge[message] = ChunkNews(0, last, round_index + self._repeats())
 
     def _take_acknowledgements(self, payload: bytes, round_index: int) -> None:
         """Mark what the neighbor acknowledges; acknowledgements of anything else have no effect."""
