@@ -18,8 +18,9 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import MotionPrior, Recording, RgbdLog, log_metadata, open_rgbd
+from duagc.pipeline.recording.log_checksums import verify
 from duagc.pipeline.recording.names import DIGEST_RECORD, is_mcap
-from duagc.pipeline.recording.read import LogFile, verify
+from duagc.pipeline.recording.read import LogFile
 from duagc.schemas.topics import COLOR
 
 __all__ = ["Finding", "Report", "Severity", "check", "check_registration", "format_report"]

@@ -7,6 +7,7 @@ The identity of a log is its content digest: the bytes of the file depend on the
 
 from duagc.pipeline.recording.exposures import read_exposures
 from duagc.pipeline.recording.folder import Recording
+from duagc.pipeline.recording.log_checksums import verify
 from duagc.pipeline.recording.log_digest import content_digest, stated_digest
 from duagc.pipeline.recording.motion import Motion, MotionPrior
 from duagc.pipeline.recording.names import (
@@ -16,7 +17,7 @@ from duagc.pipeline.recording.names import (
     RECORDING_FORMAT,
     RECORDING_SCHEMA,
 )
-from duagc.pipeline.recording.read import Record, log_metadata, merge, read_log, verify
+from duagc.pipeline.recording.read import Record, log_metadata, merge, read_log
 from duagc.pipeline.recording.rgbd import RgbdLog, open_rgbd
 from duagc.pipeline.recording.rgbd_frame import RgbdFrame
 from duagc.pipeline.recording.summary import format_info, info, write_preview_of

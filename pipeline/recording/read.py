@@ -5,39 +5,32 @@ from __future__ import annotations
 import heapq
 import struct
 import weakref
-import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Header, MessageIndex
+from mcap.records import Channel, Chunk, MessageIndex
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
 from duagc import schemas
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.progress import track
 from duagc.pipeline.base.workers import hand_down
 from duagc.pipeline.recording.access import check_read
 from duagc.pipeline.recording.identity import channel_identity, framed
-from duagc.pipeline.recording.names import LIBRARY, LOG_RECORD, MAGIC
+from duagc.pipeline.recording.log_checksums import parsing, verify
+from duagc.pipeline.recording.names import LOG_RECORD
 from duagc.schemas.topics import Topic
 from duagc.schemas.topics import find as find_topic
 
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC of the summary
-_DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of everything before
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-_PIECE_BYTES = 1 << 20
 _CHUNKS_KEPT = 4
-_LONG_BYTES = 1 << 30  # takes long enough that somebody wonders
 LATEST_NS = 1 << 63  # what a signed 64-bit number can hold
 
 
@@ -82,116 +75,31 @@ def _class_of(schema: str, schema_data: bytes) -> Any:
         return schemas.message_class_from(schema, schema_data)
 
 
-@contextmanager
-def parsing(path: Path, stream: IO[bytes] | None = None) -> Iterator[None]:
-    """Turn whatever a reader stumbles over in a broken file, or in one that was closed, into one line."""
-    try:
-        yield
-    except (DuagError, GeneratorExit):
-        raise
-    except OSError as error:
-        raise DuagError(f"{path}: {error.strerror or error}, expected an MCAP log") from error
-    except Exception as error:
-        if stream is not None and stream.closed:
-            raise DuagError(f"{path}: the log was closed, expected it open while it is read") from error
-        raise DuagError(
-            f"{path}: found {type(error).__name__} ({error}), expected a sound MCAP log"
-        ) from error
-
-
-def _crc_of(stream: IO[bytes], start: int, stop: int) -> int:
-    stream.seek(start)
-    crc = 0
-    pieces = range(start, stop, _PIECE_BYTES)
-    long = stop - start > _LONG_BYTES
-    for at in track(pieces, "compare checksums, MB") if long else pieces:
-        crc = zlib.crc32(stream.read(min(stop - at, _PIECE_BYTES)), crc)
-    return crc
-
-
-_Verified = set[tuple[str, int, int, int]]
 _PublishTimes = dict[tuple[str, int, int, int, str], dict[int, tuple[int, int, int]]]
-_verified: _Verified = set()
 _publish_times: _PublishTimes = {}
 
 
-def _known() -> tuple[_Verified, _PublishTimes]:
+def _known() -> _PublishTimes:
     """What this process knows of files, as long as they are unchanged."""
-    return set(_verified), dict(_publish_times)
+    return dict(_publish_times)
 
 
-def _learn(known: tuple[_Verified, _PublishTimes]) -> None:
-    _verified.update(known[0])
-    _publish_times.update(known[1])
+def _learn(known: _PublishTimes) -> None:
+    _publish_times.update(known)
 
 
 hand_down(_known, _learn)
-
-
-def verify(path: Path) -> None:
-    """Read a log once and compare all its checksums, unless this process has done so and the file is unchanged.
-
-    Args:
-        path: of the log.
-
-    Raises:
-        DuagError: missing, empty, no MCAP file, cut short, or any byte that differs from what was written.
-    """
-    path = Path(path)
-    with parsing(path):
-        status = path.stat()
-        if not (path.is_file() or path.is_dir()):  # a pipe might never end
-            raise DuagError(f"{path}: is no regular file, expected an MCAP log")
-        key = (str(path.resolve()), status.st_size, status.st_mtime_ns, status.st_ino)
-        if key not in _verified:
-            with path.open("rb") as stream:
-                _verify_stream(path, stream, status.st_size)
-            _verified.add(key)
-
-
-def _verify_stream(path: Path, stream: IO[bytes], size: int) -> None:
-    if size == 0:
-        raise DuagError(f"{path}: the file is empty, expected an MCAP log")
-    if stream.read(len(MAGIC)) != MAGIC:
-        raise DuagError(f"{path}: does not begin with the magic bytes of MCAP, expected an MCAP log")
-    tail = _FOOTER.size + len(MAGIC)
-    stream.seek(max(0, size - tail))
-    footer = stream.read(tail)
-    if size < len(MAGIC) + tail or not footer.endswith(MAGIC):
-        raise DuagError(
-            f"{path}: is cut short after {size} bytes: no magic bytes at the end, expected an MCAP log"
-        )
-    opcode, length, summary_start, _, summary_crc = _FOOTER.unpack_from(footer)
-    data_end_start = summary_start - _DATA_END.size
-    sound = opcode == Opcode.FOOTER and length == _FOOTER.size - 9
-    if not sound or not len(MAGIC) <= data_end_start <= size - tail - _DATA_END.size:
-        raise DuagError(f"{path}: found no summary where the footer says, expected a sound MCAP log")
-    ours = _library(stream).startswith(LIBRARY.split("/")[0])
-    found = _crc_of(stream, summary_start, size - len(MAGIC) - 4)
-    if found != summary_crc and (summary_crc or ours):
-        raise DuagError(f"{path}: the summary has checksum {found:08x}, expected {summary_crc:08x}")
-    stream.seek(data_end_start)
-    opcode, length, data_crc = _DATA_END.unpack(stream.read(_DATA_END.size))
-    if opcode != Opcode.DATA_END or length != 4:
-        raise DuagError(f"{path}: found no end of the data before the summary, expected a sound MCAP log")
-    found = _crc_of(stream, 0, data_end_start)
-    if found != data_crc and (data_crc or ours):
-        raise DuagError(f"{path}: the data has checksum {found:08x}, expected {data_crc:08x}")
-
-
-def _library(stream: IO[bytes]) -> str:
-    """What wrote the file. Other programs than ours may leave checksums out, as zero."""
-    stream.seek(len(MAGIC))
-    opcode, _ = struct.unpack("<BQ", stream.read(9))
-    if opcode != Opcode.HEADER:
-        raise ValueError(f"first record has opcode {opcode}, not that of a header")
-    return Header.read(ReadDataStream(stream)).library
 
 
 class LogFile:
     """An MCAP file that has been verified, with its summary in hand."""
 
     def __init__(self, path: Path) -> None:
+        """Verify a log and read its summary.
+
+        Args:
+            path: of the log.
+        """
         self.path = Path(path)
         verify(self.path)
         with parsing(self.path):
@@ -221,9 +129,15 @@ class LogFile:
         self.close()
 
     def close(self) -> None:
+        """Close the file; nothing can be read afterward."""
         self._stream.close()
 
     def schema_of(self, channel: Channel) -> tuple[str, bytes]:
+        """Full name and description of the schema of a channel; both empty if it has none.
+
+        Args:
+            channel: of this log.
+        """
         if channel.schema_id == 0:
             return "", b""
         schema = self.summary.schemas[channel.schema_id]
@@ -295,7 +209,11 @@ class LogFile:
         """The entry of every message of a topic by its publish time; of equal times the first.
 
         Only the messages themselves know their publish time, so all their chunks are unpacked; a process does it
-        once per file and topic. others: topics that will be asked for as well: their chunks are the same.
+        once per file and topic.
+
+        Args:
+            topic: full name.
+            others: topics that will be asked for as well: their chunks are the same.
         """
         for t in (topic, *others):
             check_read(self.path, t)
@@ -377,7 +295,12 @@ def read_log(path: Path, topics: str | Topic | Iterable[str | Topic] | None = No
 
 
 def merge(paths: Sequence[Path], topics: Iterable[str] | None = None) -> Iterator[Record]:
-    """Yield the messages of several logs, ordered by log time, then by place in `paths`, then as in their log."""
+    """Yield the messages of several logs, ordered by log time, then by place in `paths`, then as in their log.
+
+    Args:
+        paths: of the logs.
+        topics: full names; None: all.
+    """
     wanted = topics if topics is None or isinstance(topics, str) else sorted(topics)
 
     def keyed(number: int, path: Path) -> Iterator[tuple[int, int, int, Record]]:

@@ -12,10 +12,11 @@ import numpy as np
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.recording.folder import Recording
+from duagc.pipeline.recording.log_checksums import parsing
 from duagc.pipeline.recording.names import DIGEST_RECORD, LOG_RECORD, RECORDING_FILE, ROBOT_KEY
 from duagc.pipeline.recording.pairing import pair_topics
 from duagc.pipeline.recording.preview import reach, some_frames, write_preview
-from duagc.pipeline.recording.read import LogFile, parsing
+from duagc.pipeline.recording.read import LogFile
 from duagc.pipeline.recording.rgbd import open_rgbd
 from duagc.schemas import topics as topic_table
 

@@ -72,12 +72,14 @@ def test_many_chunks_come_back_in_order(tmp_path: Path) -> None:
 
 def _opened(path: Path, others: dict[str, int]) -> tuple[int, int]:
     """In a worker: how many chunks and how many checksummed bytes it takes to know all publish times of a log."""
-    from duagc.pipeline.recording import read
+    from duagc.pipeline.recording import log_checksums, read
 
     unpacked, summed = [], []
-    chunk, crc = read.LogFile._chunk, read._crc_of
+    chunk, crc = read.LogFile._chunk, log_checksums._crc_of
     read.LogFile._chunk = lambda self, start: unpacked.append(start) or chunk(self, start)  # type: ignore[method-assign]
-    read._crc_of = lambda stream, start, stop: summed.append(stop - start) or crc(stream, start, stop)
+    log_checksums._crc_of = lambda stream, start, stop: (
+        summed.append(stop - start) or crc(stream, start, stop)
+    )
     with read.LogFile(path) as log:
         assert {topic: len(log.entries_by_time(topic)) for topic in others} == others
     return len(unpacked), sum(summed)
