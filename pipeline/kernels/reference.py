@@ -17,10 +17,7 @@ from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels.definition import (
-    ALPHA_MAX,
-    ALPHA_MIN,
     SAME_LAYER,
-    SCREEN_NUMBERS,
     TRANSMITTANCE_MIN,
     Channels,
     Painting,
@@ -38,10 +35,6 @@ from duagc.pipeline.kernels.definition import (
 )
 from duagc.pipeline.kernels.types import FisherSums, Gradients, LossWeights, Render, ViewLoss
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
-
-# Relative distance from a threshold within which float32 may decide otherwise; see `decided`.
-UNSURE_ALPHA = 1e-4  # alpha and transmittance
-UNSURE_PLACE = 1e-6  # depths and directions
 
 _PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
@@ -96,7 +89,16 @@ class ReferenceRasterizer:
         mask: NDArray[np.bool_] | None = None,
         tolerance: float = SAME_LAYER,
     ) -> tuple[Render, NDArray[np.float64]]:
-        """Draw them and the depth of one layer; see `Rasterizer.forward_with_layer`."""
+        """Draw them and the depth of one layer; see `Rasterizer.forward_with_layer`.
+
+        Args:
+            gaussians: as in `forward`.
+            camera: as in `forward`.
+            T_camera_map: as in `forward`.
+            depth_kind: as in `forward`.
+            mask: as in `forward`.
+            tolerance: relative difference of depth within a layer, 0..1.
+        """
         render = self.forward(gaussians, camera, T_camera_map, depth_kind=depth_kind, mask=mask)
         return render, self._layer(tolerance)
 
@@ -122,7 +124,16 @@ class ReferenceRasterizer:
         fisher: bool = False,
         parameters: bool = True,
     ) -> Gradients:
-        """Derivatives of <d_color, color> + <d_depth, depth> + <d_alpha, alpha>; see `Rasterizer.backward`."""
+        """Derivatives of <d_color, color> + <d_depth, depth> + <d_alpha, alpha>; see `Rasterizer.backward`.
+
+        Args:
+            d_color: dL/dcolor [H, W, 3].
+            d_depth: dL/ddepth [H, W]; None is zero.
+            d_alpha: dL/dalpha [H, W]; None is zero.
+            pose: also differentiate by the right tangent of T_map_camera.
+            fisher: also give the `empirical` diagonal.
+            parameters: False takes the derivative of the pose alone.
+        """
         per_pixel = self._dot(d_color, d_depth, d_alpha)
         gradients = self._gradients(per_pixel(self._painting).sum(), pose, parameters)
         if not fisher:
@@ -137,7 +148,14 @@ class ReferenceRasterizer:
         sums: FisherSums,
         residual: ArrayLike | None = None,
     ) -> None:
-        """Add sum over pixels of J^T R^-1 J in (mean, vec log Sigma, color, logit); see `Rasterizer.fisher`."""
+        """Add sum over pixels of J^T R^-1 J in (mean, vec log Sigma, color, logit); see `Rasterizer.fisher`.
+
+        Args:
+            inv_var_color: [H, W], 1/sigma^2 of every color channel; 0 leaves the pixel out.
+            inv_var_depth: [H, W], 1/m^2; 0 leaves it out.
+            sums: of as many Gaussians; changed in place.
+            residual: [H, W], summed by weight into sums.residual.
+        """
         p = self._parameters
         log_covariances = tensor(self._log_covariances).requires_grad_()
         screen = self._project(matrix_exp(log_covariances))
@@ -189,7 +207,25 @@ class ReferenceRasterizer:
         closing: float = 0.0,
         color_table: ArrayLike | None = None,
     ) -> tuple[ViewLoss, Gradients]:
-        """Draw, compare with a measured image, differentiate; see `Rasterizer.view_gradients`."""
+        """Draw, compare with a measured image, differentiate; see `Rasterizer.view_gradients`.
+
+        Args:
+            gaussians: as in `forward`.
+            camera: as in `forward`.
+            T_camera_map: as in `forward`.
+            color: measured, [H, W, 3], RGB 0..1; or bytes with `color_table`.
+            depth_m: measured, [H, W], 0 where there is none.
+            loss: weights of the terms.
+            exposure: (a, b), log gain and offset of this image.
+            background: as in `forward`.
+            mask: as in `forward`.
+            depth_kind: as in `forward`.
+            pose: also differentiate by the right tangent of T_map_camera.
+            parameters: False takes the derivative of the pose alone.
+            depth_certainty: factor [H, W] of the depth residuals, 0..1; None: all 1.
+            closing: the Gaussian that takes the light of a pixel below this stops all that is left.
+            color_table: [256, 3], the measured color by value of a channel in `color`; None: `color` is it.
+        """
         import torch
 
         self.forward(gaussians, camera, T_camera_map, background, depth_kind=depth_kind, mask=mask)
@@ -211,66 +247,6 @@ class ReferenceRasterizer:
         """Sum of the blending weights [n] of each Gaussian and number of its pixels [n]."""
         weights = self._weights()
         return weights.sum(axis=0), (weights > 0).sum(axis=0).astype(np.uint32)
-
-    def gate_margin(self) -> float:
-        """Smallest relative distance of any pair of pixel and Gaussian from the thresholds of alpha and transmittance.
-
-        Near zero, rounding decides whether the pair is drawn, and another precision may differ visibly.
-        """
-        return float(self._margins().min(initial=1.0))
-
-    def decided(self) -> NDArray[np.bool_]:
-        """Pixels [H, W] in which no threshold of the definition is so near that float32 may decide otherwise.
-
-        The thresholds are those of `gate_margin`, the order of two depths, and the clamp of J. At each of them the
-        image or its derivative jumps, so that no precision makes two implementations agree there.
-        """
-        seen, z = self._painting.weights.detach().numpy() > 0, self._screen.depths.detach().numpy()
-        nearer = np.maximum.accumulate(np.where(seen, z, 0.0), axis=1)[:, :-1]  # the last one seen before
-        gap = 1 - nearer / z[1:]
-        mixed_up = (seen[:, 1:] & (gap > 0) & (gap < UNSURE_PLACE)).any(axis=1)
-        at_clamp = (seen & (self._from_clamp.numpy() < UNSURE_PLACE)).any(axis=1)
-        out = np.zeros(self._drawn.shape, dtype=bool)
-        out[self._drawn] = (self._margins() > UNSURE_ALPHA) & ~mixed_up & ~at_clamp
-        return out
-
-    def gradient_terms(
-        self, d_color: ArrayLike, d_depth: ArrayLike | None = None, d_alpha: ArrayLike | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What `backward` adds up to the gradients [n, 14] and the pose [6], with all signs taken away.
-
-        They are sums over pixels of sums over screen numbers. Where these cancel, rounding leaves an error in
-        proportion to this.
-
-        Args:
-            d_color: dL/dcolor [H, W, 3].
-            d_depth: dL/ddepth [H, W]; None is zero.
-            d_alpha: dL/dalpha [H, W]; None is zero.
-        """
-        terms = self._terms(self._dot(d_color, d_depth, d_alpha)).sum((0, 1))
-        return terms[:, :14], terms[:, 14:].sum(axis=0)
-
-    def empirical_terms(
-        self, d_color: ArrayLike, d_depth: ArrayLike | None = None, d_alpha: ArrayLike | None = None
-    ) -> NDArray[np.float64]:
-        """The same of `fisher_diagonal` [n, 14], whose squares are those of sums over screen numbers.
-
-        Args:
-            d_color: as in `gradient_terms`.
-            d_depth: as in `gradient_terms`.
-            d_alpha: as in `gradient_terms`.
-        """
-        return (self._terms(self._dot(d_color, d_depth, d_alpha))[..., :14] ** 2).sum((0, 1))
-
-    def information_terms(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike) -> NDArray[np.float64]:
-        """The same of the diagonal that `fisher` adds up.
-
-        Args:
-            inv_var_color: as in `full_fisher`.
-            inv_var_depth: as in `full_fisher`.
-        """
-        precision = self._precision(inv_var_color, inv_var_depth)
-        return np.einsum("cm,cmni->ni", precision, self._terms(color_and_depth)[..., :14] ** 2)
 
     # ------------------------------------------------------------ drawing
 
@@ -306,17 +282,6 @@ class ReferenceRasterizer:
         weights = np.zeros((len(self._pixels), self._n))
         weights[:, self._order] = self._painting.weights.detach().numpy()
         return weights
-
-    def _margins(self) -> NDArray[np.float64]:
-        """The `gate_margin` of every drawn pixel [m], over the Gaussians up to the one that closes it."""
-        raw, left = (gate.numpy() for gate in self._painting.gates)
-        closed = np.logical_or.accumulate(left < TRANSMITTANCE_MIN, axis=1)
-        mattering = np.ones_like(closed)
-        mattering[:, 1:] = ~closed[:, :-1]
-        margins = np.ones(len(raw))
-        for distance in (raw / ALPHA_MIN - 1, raw / ALPHA_MAX - 1, left / TRANSMITTANCE_MIN - 1):
-            margins = np.minimum(margins, np.where(mattering, np.abs(distance), 1.0).min(axis=1, initial=1.0))
-        return margins
 
     # ------------------------------------------------------------ derivatives
 
@@ -367,22 +332,6 @@ class ReferenceRasterizer:
             derivatives_by_inputs(screen, inputs, self._order),
         )
         return self._by_gaussian(np.einsum("cmks,ksp->cmkp", by_screen, by_inputs))
-
-    def _terms(self, channels: Channels) -> NDArray[np.float64]:
-        """The Jacobian [c, m, n, 14 and pose 6] with every product of the chain rule taken as positive.
-
-        Through screen numbers without long and short directions: M center, M^-T C^-1 M^-1 (which is 1) and
-        M^-T slope, with C^-1 = M^T M.
-        """
-        M = np.swapaxes(np.linalg.cholesky(self._screen.conics.detach().numpy()), 1, 2)
-        back = np.swapaxes(np.linalg.inv(M), 1, 2)
-        change = np.tile(np.eye(SCREEN_NUMBERS), (len(M), 1, 1))
-        change[:, 0:2, 0:2], change[:, 7:9, 7:9] = M, back
-        change[:, 2:6, 2:6] = np.einsum("kij,klm->kiljm", back, back).reshape(-1, 4, 4)
-        by_screen = self._by_screen(channels, self._screen)
-        by_inputs = derivatives_by_inputs(self._screen, [*self._parameters.values(), self._xi], self._order)
-        by_screen = np.abs(np.einsum("cmks,kst->cmkt", by_screen, np.linalg.inv(change)))
-        return self._by_gaussian(np.einsum("cmks,ksp->cmkp", by_screen, np.abs(change @ by_inputs)))
 
     def _by_gaussian(self, of_screen: NDArray[np.float64]) -> NDArray[np.float64]:
         """[..., k, p] in the order of the screen as [..., n, p]; what is not on the screen is zero."""

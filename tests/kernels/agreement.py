@@ -28,7 +28,7 @@ import numpy as np
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, Gradients, LossWeights, Rasterizer
-from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.kernels.reference_rounding import RoundingReference
 from duagc.pipeline.splat.information import unpack_geometry
 from duagc.pipeline.splat.losses import rgbd_loss
 from tests.kernels.scenes import Scene
@@ -204,7 +204,7 @@ class Error:
 
 def compare(scene: Scene, isa: str = "auto", depth_kind: DepthKind = "blended") -> Iterator[Error]:
     """The error of every output; inputs are moved only until all are explained."""
-    reference = ReferenceRasterizer()
+    reference = RoundingReference()
     reference.forward(scene.gaussians, scene.camera, scene.T_camera_map, scene.background)
     where = reference.decided()
     wanted = outputs(reference, scene, where, depth_kind, floors=True)

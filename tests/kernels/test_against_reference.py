@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.kernels import FisherSums, Rasterizer, available_isas
-from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.kernels.reference_rounding import RoundingReference
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS
 from duagc.pipeline.splat.information import unpack_geometry
 from tests.kernels.scenes import KINDS, make_scene
@@ -43,7 +43,7 @@ def layers_of(rasterizer, scene, depth):
 
 @cache
 def expected(kind):
-    reference = ReferenceRasterizer()
+    reference = RoundingReference()
     result = evaluate(reference, kind)
     # rounding must not decide whether a pixel sees a Gaussian; if this fails, take another seed
     assert reference.gate_margin() > 1e-4

@@ -9,7 +9,7 @@ import torch
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.kernels.autograd import rasterize
-from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.kernels.reference_rounding import RoundingReference
 from tests.kernels.scenes import make_scene
 
 PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
@@ -45,7 +45,7 @@ def test_gradients_are_those_of_the_reference(kind, xi_type, depth):
     value.backward()
 
     def reference_at(twist):
-        reference = ReferenceRasterizer()
+        reference = RoundingReference()
         pose = se3.exp(-twist) @ scene.T_camera_map
         render = reference.forward(scene.gaussians, scene.camera, pose, scene.background, depth_kind=depth)
         assert reference.gate_margin() > 1e-5  # rounding does not decide what is drawn

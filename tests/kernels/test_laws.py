@@ -11,6 +11,7 @@ from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, Rasterizer
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.kernels.reference_rounding import RoundingReference
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import unpack_geometry
 from tests.kernels.scenes import BACKGROUND, make_scene, random_gaussians
@@ -30,7 +31,7 @@ def test_any_small_scene_matches_the_reference(seed, n, size, spread):
     camera = PinholeCamera(*size, rng.uniform(5, 40), rng.uniform(5, 40), size[0] / 2, size[1] / 2)
     T, background = se3.exp(rng.normal(scale=0.2, size=6)), rng.random(3)
     d_color = rng.normal(size=(size[1], size[0], 3)).astype(np.float32)
-    reference, rasterizer = ReferenceRasterizer(), Rasterizer()
+    reference, rasterizer = RoundingReference(), Rasterizer()
     wanted = reference.forward(gaussians, camera, T, background)
     assume(reference.gate_margin() > 1e-4)
     found = rasterizer.forward(gaussians, camera, T, background)
