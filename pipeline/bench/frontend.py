@@ -99,7 +99,7 @@ def run(plan: Plan) -> dict[str, Any]:
     Raises:
         DuagError: the recording is broken, or has no such robot; Open3D cannot be imported.
     """
-    from duagc.pipeline.bench.raster import cpu_name
+    from duagc.pipeline.bench.peaks import cpu_name
 
     if plan.open3d:
         with worker_pool(1) as pool:  # not in this process, whose memory would grow

@@ -54,7 +54,7 @@ def run(plan: LengthPlan) -> dict[str, Any]:
     Raises:
         DuagError: the logs are shorter than the longest length, or a run fails.
     """
-    from duagc.pipeline.bench.raster import cpu_name
+    from duagc.pipeline.bench.peaks import cpu_name
 
     source = Recording(plan.recording)
     longest = min(seconds_of(source).values())

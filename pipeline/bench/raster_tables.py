@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from duagc.pipeline.bench.raster import FLOPS, TITLES
+from duagc.pipeline.bench.raster_work import FLOPS, TITLES
 from duagc.pipeline.bench.tables import markdown
 
 WHO = ["size", "Gaussians", "threads", "isa"]

@@ -71,7 +71,7 @@ def run(plan: RealtimePlan) -> dict[str, Any]:
     Raises:
         DuagError: the recording has fewer robots, a command fails, or there is no such command.
     """
-    from duagc.pipeline.bench.raster import cpu_name
+    from duagc.pipeline.bench.peaks import cpu_name
 
     source = Recording(plan.recording)
     if plan.other is not None and not os.access(plan.other, os.X_OK):

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from duagc.pipeline import cli
-from duagc.pipeline.bench import raster, raster_tables, torch_tiles
+from duagc.pipeline.bench import made_room, raster, raster_tables, raster_work, torch_tiles
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer, _raster, available_isas
 
@@ -21,9 +21,9 @@ def result():
 
 
 def test_the_torch_rasterizer_draws_the_same_room():
-    room, camera = raster.make_room(2000), PinholeCamera(50, 40, 25.0, 25.0, 24.5, 19.5)
-    render = Rasterizer().forward(room, camera, raster.view_of_room())
-    image = torch_tiles.draw(torch_tiles.tensors_of(room), camera, raster.view_of_room()).detach().numpy()
+    room, camera = made_room.make_room(2000), PinholeCamera(50, 40, 25.0, 25.0, 24.5, 19.5)
+    render = Rasterizer().forward(room, camera, made_room.view_of_room())
+    image = torch_tiles.draw(torch_tiles.tensors_of(room), camera, made_room.view_of_room()).detach().numpy()
     assert render.alpha.mean() > 0.9  # the room fills the view
     # float32 on both sides: a pair at a threshold may be drawn by one of them only
     assert np.abs(image[..., :3] - render.color).mean() < 1e-5
@@ -37,7 +37,7 @@ def test_a_row_per_scene_and_candidate(result):
     }
     assert {(row["width"], row["isa"], row["threads"]) for row in result["rows"]} == wanted
     for row in result["rows"]:
-        times = [row[f"{name}_ms"] for name in raster.TITLES] + [
+        times = [row[f"{name}_ms"] for name in raster_work.TITLES] + [
             row["torch_forward_ms"],
             row["torch_backward_ms"],
         ]
@@ -53,16 +53,16 @@ def test_work_is_the_same_for_every_candidate(result):
 
 
 def test_drawn_pairs_are_the_pixels_that_gaussians_count():
-    view = raster.RasterView((40, 30), 500)
+    view = raster_work.RasterView((40, 30), 500)
     rasterizer = Rasterizer()
     rasterizer.forward(view.room, view.camera, view.T_camera_map)
-    assert raster.RasterWork("auto", view).seen.blended_pairs == rasterizer.contributions()[1].sum()
+    assert raster_work.RasterWork("auto", view).seen.blended_pairs == rasterizer.contributions()[1].sum()
 
 
 def test_fraction_of_peak_is_work_over_time_over_rate(result):
     for row in result["rows"]:
         rate = 1e9 * result["machine"]["fma_gflops"][row["isa"]][str(row["threads"])]
-        flops = raster.FLOPS["backward"] * row["contributing_pairs"]
+        flops = raster_work.FLOPS["backward"] * row["contributing_pairs"]
         assert row["backward_fraction_of_peak"] == pytest.approx(flops / (1e-3 * row["backward_ms"]) / rate)
 
 
@@ -71,7 +71,7 @@ def test_tables_show_every_row(result):
     assert result["machine"]["cpu"] in text
     for isa in available_isas():
         assert f" {isa} |" in text
-    for title in raster.TITLES.values():
+    for title in raster_work.TITLES.values():
         assert f" {title} |" in text
     blocks = text.split("\n\n")
     times = blocks[2].splitlines()
@@ -97,7 +97,7 @@ def test_machine_has_a_bandwidth(threads):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_room_is_flat_along_its_walls(axis):
-    room = raster.make_room(3000)
+    room = made_room.make_room(3000)
     on_wall = room.log_scales.argmin(axis=1) == axis
     assert on_wall.mean() > 0.1
 
