@@ -14,7 +14,8 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.experiments import disturbances as d
-from duagc.pipeline.experiments.disturbances import DisturbanceRow, Shot, Undisturbed
+from duagc.pipeline.experiments.disturbed_tracking import DisturbanceRow, Undisturbed
+from duagc.pipeline.experiments.shots import Shot, filmed, resized
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
@@ -42,7 +43,7 @@ def main() -> None:
     print(f"{len(shots)} frames, {lost} lost undisturbed; {len(starts)} places")
     head = "disturbance       good while disturbed  wrong  worst mm  relocalized after  not found"
     print(f"{head}  worst mm from truth  undisturbed" if truth else head)
-    disturbances = d.further() if arguments.further else d.every(d.resized(d.filmed(5, 30, FILMED), camera))
+    disturbances = d.further() if arguments.further else d.every(resized(filmed(5, 30, FILMED), camera))
     for disturbance in disturbances:
         rows = [run.disturbed(start, disturbance, FRAMES) for start in starts]
         print(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
-from duagc.pipeline.experiments.disturbances import Undisturbed
+from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
 from duagc.pipeline.frontend.tracking import Tracker
 from tests.fixtures.films import CAMERA, FRAMES, filmed
 

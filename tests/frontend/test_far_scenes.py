@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from duagc.pipeline.experiments.disturbances import Shot, Undisturbed, track
+from duagc.pipeline.experiments.disturbed_tracking import Undisturbed, track
+from duagc.pipeline.experiments.shots import Shot
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3

@@ -9,7 +9,8 @@ import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments import disturbances as d
-from duagc.pipeline.experiments.disturbances import Shot, Undisturbed
+from duagc.pipeline.experiments.disturbed_tracking import Undisturbed, track
+from duagc.pipeline.experiments.shots import Shot
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.relocalization import Relocalizer, by_latest_keyframe
@@ -73,7 +74,7 @@ def test_color_alone_knows_no_more_than_the_frame_it_went_on_from(run: Undisturb
     last_good = tracker.state.last_good
     assert last_good is not None
     tracker.state.last_good = replace(last_good, information=1e2 * np.eye(6))  # 10 cm, 0.1 rad
-    frame, _ = d.track(tracker, replace(shot, depth=np.zeros_like(shot.depth)))
+    frame, _ = track(tracker, replace(shot, depth=np.zeros_like(shot.depth)))
     covariance = np.linalg.inv(frame.information)
     assert np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[0]) > 0.099
 
@@ -83,9 +84,9 @@ def test_color_alone_must_look_as_before(run: Undisturbed) -> None:
     tracker, shot = run.tracker(START), run.shots[START]
     darker = (0.6 * shot.color.astype(np.float32)).astype(np.uint8)
     blind = replace(shot, depth=np.zeros_like(shot.depth))
-    frame, _ = d.track(run.tracker(START), blind)
+    frame, _ = track(run.tracker(START), blind)
     assert (frame.status, frame.reason) == (Status.OK, Reason.NO_DEPTH)
-    frame, _ = d.track(tracker, replace(blind, color=darker))
+    frame, _ = track(tracker, replace(blind, color=darker))
     assert frame.status is Status.LOST
 
 
@@ -100,12 +101,12 @@ def test_what_looks_unlike_is_followed_only_where_it_was_expected(run: Undisturb
         return replace(shot, color=np.clip(shot.color + noise, 0, 255).astype(np.uint8))
 
     beyond = replace(beyond, index=here.index, stamp_ns=here.stamp_ns)
-    found = [d.track(run.tracker(START), shot)[0] for shot in (here, beyond, unlike(here), unlike(beyond))]
+    found = [track(run.tracker(START), shot)[0] for shot in (here, beyond, unlike(here), unlike(beyond))]
     assert [frame.status for frame in found] == [Status.OK, Status.OK, Status.OK, Status.LOST]
     all_of_it = {"tracking": {"strides": (2, 1, 1, 1), "failure": {"min_overlap_unlike": 1.0}}}
     for shot, status in ((here, Status.OK), (unlike(here), Status.LOST)):
         tracker = run.tracker(START, FrontendConfig.model_validate(all_of_it))
-        assert d.track(tracker, shot)[0].status is status
+        assert track(tracker, shot)[0].status is status
 
 
 def _drifted(run: Undisturbed) -> Tracker:

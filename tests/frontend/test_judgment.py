@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from duagc.pipeline.experiments.disturbances import Undisturbed
+from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.judgment import Judgment, PairVerdict, judge
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph

@@ -14,7 +14,8 @@ import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments import disturbances as d
-from duagc.pipeline.experiments.disturbances import DisturbanceRow, Shot, Undisturbed
+from duagc.pipeline.experiments.disturbed_tracking import DisturbanceRow, Undisturbed, track
+from duagc.pipeline.experiments.shots import Shot, resized
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.failure import FrozenImageDetector, Reason, free_space_violations
 from duagc.pipeline.frontend.tracked import Status
@@ -104,10 +105,10 @@ def test_a_hand_outside_the_keyframe_s_view_is_noticed(run: Undisturbed) -> None
     blind = replace(current.coarsest, inverse_depth=np.zeros_like(current.coarsest.inverse_depth))
     tracker.state.keyframes = [*before, replace(current, coarsest=blind)]
     clear, *behind = list(d.hand(run.shots[STARTS[0] : STARTS[0] + 4], np.random.default_rng(0)))
-    frame, _ = d.track(tracker, run.shots[clear.index])
+    frame, _ = track(tracker, run.shots[clear.index])
     assert frame.keyframe_index == len(before) + 1  # every good frame becomes a keyframe here
     tracker.keyframes[-1] = replace(tracker.keyframes[-1], coarsest=blind)
-    assert {d.track(tracker, shot)[0].keyframe_index for shot in behind} == {len(before) + 1}
+    assert {track(tracker, shot)[0].keyframe_index for shot in behind} == {len(before) + 1}
 
 
 @pytest.mark.parametrize("start", sampled(STARTS))
@@ -199,7 +200,7 @@ def test_a_slow_camera_does_not_pause(run: Undisturbed) -> None:
     """Frames that always come half a second apart are followed."""
     tracker = Tracker(CAMERA, CONFIG)
     slow = [replace(shot, stamp_ns=shot.index * 500_000_000) for shot in run.shots[:6]]
-    assert {d.track(tracker, shot)[0].status for shot in slow} == {Status.OK}
+    assert {track(tracker, shot)[0].status for shot in slow} == {Status.OK}
 
 
 def test_late_stamps_do_not_throw_the_prediction(run: Undisturbed) -> None:
@@ -207,7 +208,7 @@ def test_late_stamps_do_not_throw_the_prediction(run: Undisturbed) -> None:
     tracker = run.tracker(STARTS[0])
     shots = run.shots[STARTS[0] : STARTS[0] + 3]
     for shot, later_ns in zip(shots[:2], (30_000_000, 0), strict=True):
-        d.track(tracker, replace(shot, stamp_ns=shot.stamp_ns + later_ns))
+        track(tracker, replace(shot, stamp_ns=shot.stamp_ns + later_ns))
     predicted = tracker.state.predict(shots[2].stamp_ns).T_keyframe_camera
     T_map_keyframe = tracker.state.keyframe.T_map_keyframe
     expected = run.poses[shots[2].index]
@@ -221,7 +222,7 @@ def test_a_covered_beginning_is_waited_out(run: Undisturbed) -> None:
     for shot in run.shots[:8]:
         if shot.index < 4:
             shot = next(d.covered([shot], np.random.default_rng(0)))
-        frames.append(d.track(tracker, shot)[0])
+        frames.append(track(tracker, shot)[0])
     assert [f.status for f in frames] == [Status.LOST] * 5 + [Status.OK] * 3
     assert tracker.keyframes[0].frame_index == 5
 
@@ -279,7 +280,7 @@ def test_red_kitchen_is_never_silently_wrong(
     run = Undisturbed(Tracker(camera, FrontendConfig()), shots, starts)
     lost = [frame.frame_index for frame in run.frames if frame.status is Status.LOST]
     assert not lost
-    every = d.every(d.resized(other_room, camera))
+    every = d.every(resized(other_room, camera))
     wrong, found = [], 0
     for start in starts:
         for disturbance in every:

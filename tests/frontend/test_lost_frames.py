@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from duagc.pipeline.experiments.disturbances import Undisturbed
+from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.lost_frames import found_afterwards
 from duagc.pipeline.frontend.submaps import lost

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from duagc.pipeline.experiments.disturbances import Shot, Undisturbed, track
+from duagc.pipeline.experiments.disturbed_tracking import Undisturbed, track
+from duagc.pipeline.experiments.shots import Shot
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3

@@ -14,7 +14,7 @@ from duagc.converters.simulate.scenes.catalog import build
 from duagc.converters.simulate.scenes.scene import Ball, Scene, Side, Surface
 from duagc.converters.simulate.settings import camera_of
 from duagc.converters.simulate.trajectories.loops import look_at
-from duagc.pipeline.experiments.disturbances import FRAME_NS, Shot
+from duagc.pipeline.experiments.shots import FRAME_NS, Shot
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline import registration
-from duagc.pipeline.experiments.disturbances import Undisturbed
+from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
 from duagc.pipeline.frontend import nearby_registration, pose_checks
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig
-from duagc.pipeline.experiments.disturbances import Undisturbed
+from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.pose_optimization import OptimizedPath, PathOptimization
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe

@@ -16,7 +16,7 @@ import pytest
 
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
-from duagc.pipeline.experiments.disturbances import Shot
+from duagc.pipeline.experiments.shots import Shot
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
