@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from duagc.converters.simulate.render import meshes, triangles
 from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
+from duagc.converters.simulate.scenes import painting
 from duagc.converters.simulate.scenes import textures as tex
 from duagc.converters.simulate.scenes.scene import Scene
 from duagc.converters.simulate.trajectories.routes import ROUTE_STEP_M, length_of, route
@@ -144,7 +145,7 @@ def _figure(k: int, seed: int) -> Scene:
     """Legs, a coat, arms and a head, in the axes of the mover."""
     scene = Scene(f"mover{k}", seed, np.full(3, 1e6), even_light=0.9)
     rng = random_streams.generator(seed, "simulate.figure-colors", mover=k)
-    coat = tex.fabric(tex.vivid(rng, 0.8), tex.vivid(rng, 0.5))
+    coat = tex.fabric(painting.vivid(rng, 0.8), painting.vivid(rng, 0.5))
     for side, y in (("left", 0.1), ("right", -0.1)):
         scene.cylinder(
             f"leg {side}", (0.0, y, 0.02), tex.fabric((62, 70, 92), (90, 86, 80)), radius=0.085, height=0.8

@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from duagc.converters.simulate.scenes import drawn
+from duagc.converters.simulate.scenes import drawn, painting
 from duagc.converters.simulate.scenes import furniture as fur
 from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes import wood_textures as wooden
 from duagc.converters.simulate.scenes.furniture import Place
 from duagc.converters.simulate.scenes.scene import Flat, Lamp, Scene
 from duagc.pipeline.base import random_streams
@@ -101,7 +102,7 @@ def corridor(seed: int) -> Scene:
 
 
 def _shell(
-    scene: Scene, rng: np.random.Generator, lamps: list[tuple[float, float]], floor: tex.Material
+    scene: Scene, rng: np.random.Generator, lamps: list[tuple[float, float]], floor: painting.Material
 ) -> None:
     """Floor, ceiling with shining panels, and four outer walls with windows to the north and the south."""
     w, d, h = scene.size.tolist()
@@ -120,9 +121,9 @@ def _shell(
         scene.lamps.append(Lamp(np.array([cx, cy, h - 0.02]), 0.3 * x, 0.6 * y, 0.75))
 
 
-def _windows(rng: np.random.Generator, width: float, height: float) -> tex.Material:
+def _windows(rng: np.random.Generator, width: float, height: float) -> painting.Material:
     """An outer wall with a window every few meters and pictures between."""
-    patches: list[tuple[tex.Material, float, float, float, float]] = []
+    patches: list[tuple[painting.Material, float, float, float, float]] = []
     at = float(rng.uniform(0.5, 1.0))
     while at < width - 1.7:
         patches.append((drawn.window, at, 0.45, 1.4, 1.2))
@@ -134,13 +135,13 @@ def _windows(rng: np.random.Generator, width: float, height: float) -> tex.Mater
     return tex.paint_onto(tex.plaster(PAINTS[int(rng.integers(0, len(PAINTS)))]), patches)
 
 
-def _with_doors(rng: np.random.Generator, width: float, height: float) -> tex.Material:
+def _with_doors(rng: np.random.Generator, width: float, height: float) -> painting.Material:
     """A wall with painted doors and boards of notices between them."""
-    patches: list[tuple[tex.Material, float, float, float, float]] = []
+    patches: list[tuple[painting.Material, float, float, float, float]] = []
     at = float(rng.uniform(0.4, 0.9))
     while at < width - 1.1:
-        tone = tex.shaded(rng, (146, 108, 74), 0.2)
-        patches.append((tex.front(tone, 1, 2), at, height - 2.08, 0.95, 2.08))
+        tone = painting.shaded(rng, (146, 108, 74), 0.2)
+        patches.append((wooden.front(tone, 1, 2), at, height - 2.08, 0.95, 2.08))
         kind = fur.PICTURES[int(rng.integers(0, 4))]
         if at + 2.3 < width:
             patches.append((drawn.picture(kind), at + 1.25, height - 2.1, float(rng.uniform(0.6, 1.0)), 0.8))
@@ -162,7 +163,7 @@ def _wall_along_x(
     h = float(scene.size[2])
     low = y - WALL_M if name == "south" else y
     edges = [x0, *(e for x in doors for e in (x - DOOR_M / 2, x + DOOR_M / 2)), x1]
-    trim = tex.wood((150, 118, 84))
+    trim = wooden.wood((150, 118, 84))
     paints = [tex.plaster(PAINTS[int(k)]) for k in rng.integers(0, len(PAINTS), 2)]
     for k, (a, b) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
         faces: dict[str, Any] = {
@@ -172,7 +173,7 @@ def _wall_along_x(
     for k, x in enumerate(doors):
         size = (DOOR_M, WALL_M, h - DOOR_HEIGHT_M)
         scene.box(f"{name}/lintel{k}", (x - DOOR_M / 2, low, DOOR_HEIGHT_M), size, paints[0], under=trim)
-        leaf = tex.front(tex.shaded(rng, (146, 108, 74), 0.2), 1, 2)
+        leaf = wooden.front(painting.shaded(rng, (146, 108, 74), 0.2), 1, 2)
         inside = -1.0 if name == "south" else 1.0
         hinge = (x - DOOR_M / 2 + 0.02, low if inside < 0 else low + WALL_M)
         corner = (hinge[0], hinge[1] - 0.95 if inside < 0 else hinge[1], 0.01)
@@ -228,8 +229,8 @@ def _lounge(scene: Scene, rng: np.random.Generator, room: Rect) -> None:
     x0, y0, x1, y1 = room
     fur.sofa(Place(scene, "lounge/sofa", (x0 + x1) / 2 + 0.4, y1, NORTH), rng)
     table = Place(scene, "lounge/table", (x0 + x1) / 2 + 0.3, y1 - 1.6, 0.15)
-    table.box("top", (-0.5, -0.3, 0.38), (1.0, 0.6, 0.05), tex.wood((136, 90, 56)))
-    table.legs("leg", (-0.47, -0.27, 0), (0.94, 0.54, 0.38), tex.wood((100, 66, 44)), thick=0.06)
+    table.box("top", (-0.5, -0.3, 0.38), (1.0, 0.6, 0.05), wooden.wood((136, 90, 56)))
+    table.legs("leg", (-0.47, -0.27, 0), (0.94, 0.54, 0.38), wooden.wood((100, 66, 44)), thick=0.06)
     table.box("paper", (-0.2, -0.1, 0.43), (0.3, 0.22, 0.02), drawn.picture("landscape"), yaw_rad=0.4)
     rug_at = Place(scene, "lounge/rug", (x0 + x1) / 2 + 0.3, y1 - 1.6)
     rug_at.box("rug", (-1.1, -0.75, 0.0), (2.2, 1.5, 0.012), tex.plaster((120, 90, 70)), top=tex.rug)

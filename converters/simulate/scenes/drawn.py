@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from duagc.converters.simulate.scenes.textures import Image, Material, cloud, flat, shaded, shape_of, vivid
+from duagc.converters.simulate.scenes.painting import Image, Material, cloud, flat, shaded, shape_of, vivid
 
 
 def picture(kind: str) -> Material:

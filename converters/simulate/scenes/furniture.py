@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from duagc.converters.simulate.scenes import drawn
+from duagc.converters.simulate.scenes import drawn, painting
 from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes import wood_textures as wooden
 from duagc.converters.simulate.scenes.scene import Scene
 from duagc.pipeline.base.arrays import Array
 
@@ -49,7 +50,7 @@ class Place:
         name: str,
         low: ArrayLike,
         size: ArrayLike,
-        material: tex.Material,
+        material: painting.Material,
         *,
         yaw_rad: float = 0.0,
         **faces: Any,
@@ -71,7 +72,7 @@ class Place:
         )
 
     def legs(
-        self, name: str, low: ArrayLike, size: ArrayLike, material: tex.Material, *, thick: float
+        self, name: str, low: ArrayLike, size: ArrayLike, material: painting.Material, *, thick: float
     ) -> None:
         """Four legs under a box.
 
@@ -88,7 +89,7 @@ class Place:
             self.box(f"{name}{i}", corner, (thick, thick, size[2]), material)
 
     def cylinder(
-        self, name: str, base: ArrayLike, material: tex.Material, *, radius: float, height: float
+        self, name: str, base: ArrayLike, material: painting.Material, *, radius: float, height: float
     ) -> None:
         """An upright cylinder.
 
@@ -101,7 +102,7 @@ class Place:
         """
         self.scene.cylinder(f"{self.name}/{name}", self.world(base), material, radius=radius, height=height)
 
-    def sphere(self, name: str, center: ArrayLike, radius: float, material: tex.Material) -> None:
+    def sphere(self, name: str, center: ArrayLike, radius: float, material: painting.Material) -> None:
         """A sphere.
 
         Args:
@@ -120,15 +121,15 @@ def desk(at: Place, rng: np.random.Generator) -> None:
         at: where it stands.
         rng: source of colors and details.
     """
-    dark = tex.wood(DARK)
-    at.box("top", (-0.75, -0.75, 0.71), (1.5, 0.75, 0.04), tex.wood(PINE))
+    dark = wooden.wood(DARK)
+    at.box("top", (-0.75, -0.75, 0.71), (1.5, 0.75, 0.04), wooden.wood(PINE))
     at.legs("leg", (-0.72, -0.72, 0), (1.44, 0.68, 0.71), dark, thick=0.06)
     at.box(
         "drawers",
         (0.22, -0.68, 0.18),
         (0.42, 0.6, 0.52),
-        tex.wood(OAK),
-        front=tex.front((170, 126, 82), 1, 3),
+        wooden.wood(OAK),
+        front=wooden.front((170, 126, 82), 1, 3),
     )
     left = float(rng.uniform(-0.55, -0.25))
     black = tex.plaster((38, 38, 42), 0.1)
@@ -157,7 +158,7 @@ def chair(at: Place, rng: np.random.Generator, yaw_rad: float = 0.0) -> None:
     cloth = tex.fabric(*CLOTHS[int(rng.integers(0, len(CLOTHS)))])
     own = Place(at.scene, at.name, at.x, at.y, at.yaw_rad + yaw_rad)
     own.box("seat", (-0.22, -0.22, 0.42), (0.44, 0.44, 0.06), cloth)
-    own.legs("leg", (-0.21, -0.21, 0), (0.42, 0.42, 0.42), tex.wood(DARK), thick=0.045)
+    own.legs("leg", (-0.21, -0.21, 0), (0.42, 0.42, 0.42), wooden.wood(DARK), thick=0.045)
     own.box("back", (-0.22, -0.22, 0.54), (0.44, 0.05, 0.4), cloth)
 
 
@@ -170,8 +171,8 @@ def shelf(at: Place, rng: np.random.Generator, width: float, height: float = 2.0
         width: meters.
         height: meters.
     """
-    oak, board, rows, depth = tex.wood((150, 106, 66)), 0.03, 5, 0.32
-    at.box("back", (-width / 2, -0.02, 0), (width, 0.02, height), tex.wood((112, 78, 50)))
+    oak, board, rows, depth = wooden.wood((150, 106, 66)), 0.03, 5, 0.32
+    at.box("back", (-width / 2, -0.02, 0), (width, 0.02, height), wooden.wood((112, 78, 50)))
     for side, x in (("left", -width / 2), ("right", width / 2 - board)):
         at.box(side, (x, -depth, 0), (board, depth - 0.02, height), oak)
     step = (height - board) / rows
@@ -202,20 +203,23 @@ def cabinet(at: Place, rng: np.random.Generator, width: float = 1.2, height: flo
         height: meters.
     """
     columns = max(2, round(width / 0.45))
-    tone = tex.shaded(rng, (182, 160, 126), 0.12)
+    tone = painting.shaded(rng, (182, 160, 126), 0.12)
     at.box(
         "body",
         (-width / 2, -0.45, 0),
         (width, 0.45, height),
-        tex.wood(tone),
-        front=tex.front(tone, columns, 3),
+        wooden.wood(tone),
+        front=wooden.front(tone, columns, 3),
     )
     cover = tex.marbled((92, 70, 60), (124, 92, 74))
     at.box("books", (-width / 2 + 0.08, -0.3, height), (0.36, 0.18, 0.25), cover, front=drawn.spines)
-    glaze = tex.marbled(tex.vivid(rng), (226, 206, 176), 0.08)
+    glaze = tex.marbled(painting.vivid(rng), (226, 206, 176), 0.08)
     at.cylinder("jar", (0.1 * width, -0.22, height), glaze, radius=0.09, height=float(rng.uniform(0.16, 0.3)))
     at.sphere(
-        "ball", (0.36 * width, -0.22, height + 0.11), 0.11, tex.marbled(tex.vivid(rng), (70, 96, 130), 0.1)
+        "ball",
+        (0.36 * width, -0.22, height + 0.11),
+        0.11,
+        tex.marbled(painting.vivid(rng), (70, 96, 130), 0.1),
     )
 
 
@@ -230,11 +234,11 @@ def plant(at: Place, rng: np.random.Generator, high: float = 1.0) -> None:
     at.cylinder(
         "pot",
         (0, 0, 0),
-        tex.marbled(tex.shaded(rng, (168, 96, 66), 0.15), (120, 70, 52), 0.1),
+        tex.marbled(painting.shaded(rng, (168, 96, 66), 0.15), (120, 70, 52), 0.1),
         radius=0.2,
         height=0.4,
     )
-    at.cylinder("stem", (0, 0, 0.4), tex.wood((96, 74, 50)), radius=0.03, height=high - 0.6)
+    at.cylinder("stem", (0, 0, 0.4), wooden.wood((96, 74, 50)), radius=0.03, height=high - 0.6)
     at.sphere("leaves", (0, 0, high), float(rng.uniform(0.26, 0.34)), tex.foliage)
 
 
@@ -263,7 +267,7 @@ def sofa(at: Place, rng: np.random.Generator, width: float = 1.7) -> None:
     for side, x in (("left", -width / 2 - 0.2), ("right", width / 2)):
         at.box(side, (x, -0.85, 0.1), (0.2, 0.85, 0.5), cloth)
     for k in range(2):
-        pillow = tex.fabric(tex.vivid(rng, 0.6), (220, 206, 170))
+        pillow = tex.fabric(painting.vivid(rng, 0.6), (220, 206, 170))
         low = (-width / 2 + 0.15 + 0.8 * k, -0.42, 0.42)
         at.box(f"cushion{k}", low, (0.42, 0.13, 0.34), pillow, yaw_rad=float(rng.uniform(-0.2, 0.2)))
 
@@ -276,8 +280,8 @@ def meeting_table(at: Place, rng: np.random.Generator, length: float = 2.4) -> N
         rng: source of colors and details.
         length: meters.
     """
-    at.box("top", (-length / 2, -0.5, 0.7), (length, 1.0, 0.05), tex.wood((136, 90, 56)))
-    at.legs("leg", (-length / 2 + 0.05, -0.45, 0), (length - 0.1, 0.9, 0.7), tex.wood(DARK), thick=0.08)
+    at.box("top", (-length / 2, -0.5, 0.7), (length, 1.0, 0.05), wooden.wood((136, 90, 56)))
+    at.legs("leg", (-length / 2 + 0.05, -0.45, 0), (length - 0.1, 0.9, 0.7), wooden.wood(DARK), thick=0.08)
     for k in range(4):
         low = (-length / 2 + 0.2 + k * (length - 0.4) / 4, float(rng.uniform(-0.35, 0.1)), 0.75)
         kind = PICTURES[int(rng.integers(0, 4))]
@@ -301,13 +305,13 @@ def copier(at: Place, rng: np.random.Generator) -> None:
         at: where it stands.
         rng: source of colors and details.
     """
-    gray = tex.plaster(tex.shaded(rng, (204, 204, 198), 0.05), 0.05)
+    gray = tex.plaster(painting.shaded(rng, (204, 204, 198), 0.05), 0.05)
     at.box(
         "body",
         (-0.35, -0.62, 0),
         (0.7, 0.6, 0.85),
         gray,
-        front=tex.front((186, 188, 190), 1, 4, (70, 72, 76)),
+        front=wooden.front((186, 188, 190), 1, 4, (70, 72, 76)),
     )
     at.box("lid", (-0.35, -0.62, 0.87), (0.7, 0.6, 0.12), tex.plaster((84, 88, 96), 0.1))
     at.box("panel", (-0.3, -0.72, 0.9), (0.4, 0.1, 0.05), drawn.screen)
@@ -323,8 +327,8 @@ def lockers(at: Place, rng: np.random.Generator, count: int = 4) -> None:
         count: how many, each 0.4 m wide.
     """
     width = 0.4 * count
-    tone = tex.shaded(rng, (96, 122, 140), 0.15)
-    at.box("body", (-width / 2, -0.45, 0), (width, 0.45, 1.85), STEEL, front=tex.front(tone, count, 2))
+    tone = painting.shaded(rng, (96, 122, 140), 0.15)
+    at.box("body", (-width / 2, -0.45, 0), (width, 0.45, 1.85), STEEL, front=wooden.front(tone, count, 2))
     at.box("top", (-width / 2 + 0.1, -0.4, 1.85), (0.5, 0.35, 0.26), drawn.carton, yaw_rad=0.1)
 
 
@@ -336,11 +340,11 @@ def bench(at: Place, rng: np.random.Generator, length: float = 1.6) -> None:
         rng: source of colors and details.
         length: meters.
     """
-    wood = tex.wood(tex.shaded(rng, OAK, 0.1))
+    wood = wooden.wood(painting.shaded(rng, OAK, 0.1))
     for k in range(3):
         at.box(f"board{k}", (-length / 2, -0.5 + 0.15 * k, 0.42), (length, 0.12, 0.04), wood)
     at.legs("leg", (-length / 2 + 0.1, -0.48, 0), (length - 0.2, 0.4, 0.42), STEEL, thick=0.06)
-    bag = tex.fabric(tex.vivid(rng, 0.7), (60, 54, 50))
+    bag = tex.fabric(painting.vivid(rng, 0.7), (60, 54, 50))
     at.box("bag", (0.2, -0.42, 0.46), (0.4, 0.2, 0.3), bag, yaw_rad=float(rng.uniform(-0.3, 0.3)))
 
 
@@ -359,13 +363,13 @@ def cooler(at: Place, rng: np.random.Generator) -> None:
 
 
 def decorated(
-    base: tex.Material,
+    base: painting.Material,
     width: float,
     height: float,
     rng: np.random.Generator,
     *,
     free: tuple[float, float] = (0.0, 0.0),
-) -> tex.Material:
+) -> painting.Material:
     """A wall with a skirting board and pictures at eye height.
 
     Args:

@@ -5,9 +5,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from duagc.converters.simulate.scenes import drawn
+from duagc.converters.simulate.scenes import drawn, painting
 from duagc.converters.simulate.scenes import furniture as fur
 from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes import wood_textures as wooden
 from duagc.converters.simulate.scenes.furniture import Place
 from duagc.converters.simulate.scenes.scene import Flat, Scene
 from duagc.pipeline.base import random_streams
@@ -73,7 +74,9 @@ def _facades(scene: Scene, rng: np.random.Generator) -> None:
             }
             size = (wide, deep, high) if side in ("south", "north") else (deep, wide, high)
             plain = (
-                tex.bricks() if rng.random() < 0.5 else tex.plaster(tex.shaded(rng, RENDERS[2], 0.15), 0.1)
+                tex.bricks()
+                if rng.random() < 0.5
+                else tex.plaster(painting.shaded(rng, RENDERS[2], 0.15), 0.1)
             )
             scene.box(f"{side}{k}", low[side], size, plain, **faces)
             at += wide
@@ -118,7 +121,7 @@ def _square(scene: Scene, rng: np.random.Generator) -> None:
     scene.cylinder("posters", (4.4, 12.6, 0), posters, radius=0.6, height=2.6)
     for k, (x, y) in enumerate(((18.6, 10.0), (18.6, 16.0), (18.6, 22.0))):
         box = Place(scene, f"flowers{k}", x, y, float(rng.uniform(-0.1, 0.1)))
-        box.box("trough", (-0.3, -1.1, 0), (0.6, 2.2, 0.5), tex.wood((150, 112, 76)), top=tex.foliage)
+        box.box("trough", (-0.3, -1.1, 0), (0.6, 2.2, 0.5), wooden.wood((150, 112, 76)), top=tex.foliage)
         box.sphere("bush", (0.0, float(rng.uniform(-0.6, 0.6)), 0.7), 0.36, tex.foliage)
     kiosk = Place(scene, "kiosk", 13.0, 27.5, 0.3)
     kiosk.box("body", (-1.2, -0.9, 0), (2.4, 1.8, 2.4), tex.plaster((66, 104, 92), 0.1), front=drawn.spines)
@@ -153,7 +156,7 @@ def _tree(at: Place, rng: np.random.Generator) -> None:
     """A trunk and a crown of three balls of leaves."""
     high = float(rng.uniform(2.2, 3.0))
     at.cylinder(
-        "trunk", (0, 0, 0), tex.wood((104, 82, 60)), radius=float(rng.uniform(0.14, 0.22)), height=high
+        "trunk", (0, 0, 0), wooden.wood((104, 82, 60)), radius=float(rng.uniform(0.14, 0.22)), height=high
     )
     for k in range(3):
         out = rng.uniform(-0.6, 0.6, 2)
@@ -163,8 +166,8 @@ def _tree(at: Place, rng: np.random.Generator) -> None:
 
 def _car(at: Place, rng: np.random.Generator) -> None:
     """A parked car of boxes, along x."""
-    paint = tex.shaded(rng, tex.vivid(rng, 0.75), 0.1)
-    body, glass = tex.front(paint, 4, 1, (40, 40, 44)), tex.marbled((52, 62, 74), (110, 130, 146), 0.5)
+    paint = painting.shaded(rng, painting.vivid(rng, 0.75), 0.1)
+    body, glass = wooden.front(paint, 4, 1, (40, 40, 44)), tex.marbled((52, 62, 74), (110, 130, 146), 0.5)
     coat = tex.plaster(paint, 0.06)
     at.box("body", (-2.05, -0.85, 0.28), (4.1, 1.7, 0.62), coat, front=body, back=body)
     at.box("cabin", (-1.2, -0.76, 0.9), (2.2, 1.52, 0.52), glass, top=coat)
@@ -176,7 +179,7 @@ def _car(at: Place, rng: np.random.Generator) -> None:
         at.box(f"wheel{k}", (x - 0.3, y, 0.0), (0.6, 0.2, 0.6), tyre)
 
 
-def asphalt(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
+def asphalt(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> painting.Image:
     """Dark, with patches, cracks and stains.
 
     Args:
@@ -185,9 +188,9 @@ def asphalt(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
         height_m: height of the surface, meters.
         texel_m: width of a texel, meters.
     """
-    h, w = tex.shape_of(width_m, height_m, texel_m)
-    image = tex.flat((h, w), (104, 104, 106))
-    image *= (1 + 0.10 * tex.cloud(rng, (h, w), 0.5 / texel_m, 5, gain=0.8))[..., None]
+    h, w = painting.shape_of(width_m, height_m, texel_m)
+    image = painting.flat((h, w), (104, 104, 106))
+    image *= (1 + 0.10 * painting.cloud(rng, (h, w), 0.5 / texel_m, 5, gain=0.8))[..., None]
     for _ in range(int(0.08 * width_m * height_m)):
         x, y = int(rng.integers(0, w)), int(rng.integers(0, h))
         size = rng.uniform(0.4, 2.2, 2) / texel_m
@@ -206,7 +209,7 @@ def asphalt(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
     return image
 
 
-def lawn(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
+def lawn(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> painting.Image:
     """Grass of uneven green with flowers, in a border of stone.
 
     Args:
@@ -215,17 +218,17 @@ def lawn(rng: np.random.Generator, width_m: float, height_m: float, texel_m: flo
         height_m: height of the surface, meters.
         texel_m: width of a texel, meters.
     """
-    h, w = tex.shape_of(width_m, height_m, texel_m)
-    image = tex.flat((h, w), (84, 116, 58))
-    image *= (1 + 0.22 * tex.cloud(rng, (h, w), 0.25 / texel_m, 4, gain=0.9))[..., None]
+    h, w = painting.shape_of(width_m, height_m, texel_m)
+    image = painting.flat((h, w), (84, 116, 58))
+    image *= (1 + 0.22 * painting.cloud(rng, (h, w), 0.25 / texel_m, 4, gain=0.9))[..., None]
     for _ in range(int(9 * width_m * height_m)):
         at = (int(rng.integers(0, w)), int(rng.integers(0, h)))
-        cv2.circle(image, at, max(1, round(0.025 / texel_m)), tex.vivid(rng), -1, cv2.LINE_AA)
+        cv2.circle(image, at, max(1, round(0.025 / texel_m)), painting.vivid(rng), -1, cv2.LINE_AA)
     cv2.rectangle(image, (0, 0), (w - 1, h - 1), (176, 170, 158), max(2, round(0.25 / texel_m)))
     return image
 
 
-def stripes(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
+def stripes(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> painting.Image:
     """A crossing: white bars on asphalt, along the shorter side.
 
     Args:
@@ -235,7 +238,7 @@ def stripes(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
         texel_m: width of a texel, meters.
     """
     image = asphalt(rng, width_m, height_m, texel_m)
-    wear = 1 + 0.08 * tex.cloud(rng, image.shape[:2], 0.3 / texel_m, 3, gain=0.8)
+    wear = 1 + 0.08 * painting.cloud(rng, image.shape[:2], 0.3 / texel_m, 3, gain=0.8)
     step = 1.0 / texel_m
     for k in range(int(max(image.shape[:2]) / step) + 1):
         bar = slice(round(k * step), round((k + 0.5) * step))
@@ -244,16 +247,18 @@ def stripes(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
     return image
 
 
-def facade(color: tex.Color) -> tex.Material:
+def facade(color: painting.Color) -> painting.Material:
     """The front of a house: rows of windows of its own kind, a door, a shop sign, stains.
 
     Args:
         color: RGB, 0 to 255, of the wall.
     """
 
-    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
-        wall = tex.bricks(color) if rng.random() < 0.35 else tex.plaster(tex.shaded(rng, color, 0.1), 0.09)
-        patches: list[tuple[tex.Material, float, float, float, float]] = []
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> painting.Image:
+        wall = (
+            tex.bricks(color) if rng.random() < 0.35 else tex.plaster(painting.shaded(rng, color, 0.1), 0.09)
+        )
+        patches: list[tuple[painting.Material, float, float, float, float]] = []
         wide, high = float(rng.uniform(0.95, 1.4)), float(rng.uniform(1.2, 1.55))
         gap = float(rng.uniform(0.75, 1.3))
         count = max(1, int((width_m - 0.6) / (wide + gap)))
@@ -265,8 +270,8 @@ def facade(color: tex.Color) -> tex.Material:
             for k in range(count):
                 x = left + k * (wide + gap)
                 if floor == 0 and k == door:
-                    tone = tex.shaded(rng, (110, 76, 56), 0.3)
-                    patches.append((tex.front(tone, 2, 3), x, height_m - 2.2, min(wide, 1.1), 2.2))
+                    tone = painting.shaded(rng, (110, 76, 56), 0.3)
+                    patches.append((wooden.front(tone, 2, 3), x, height_m - 2.2, min(wide, 1.1), 2.2))
                     continue
                 patches.append((pane, x, top, wide, high))
                 sill = tex.plaster((214, 208, 194), 0.06)
@@ -279,7 +284,7 @@ def facade(color: tex.Color) -> tex.Material:
     return paint
 
 
-def pane(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
+def pane(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> painting.Image:
     """A window from outside: dark glass, curtains, bars.
 
     Args:
@@ -288,10 +293,10 @@ def pane(rng: np.random.Generator, width_m: float, height_m: float, texel_m: flo
         height_m: height of the surface, meters.
         texel_m: width of a texel, meters.
     """
-    h, w = tex.shape_of(width_m, height_m, texel_m)
-    image = tex.flat((h, w), tex.shaded(rng, (58, 70, 84), 0.3))
-    image *= (1 + 0.2 * tex.cloud(rng, (h, w), 0.4 / texel_m, 3, gain=0.7))[..., None]
-    curtain = tex.shaded(rng, tex.vivid(rng, 0.5), 0.1)
+    h, w = painting.shape_of(width_m, height_m, texel_m)
+    image = painting.flat((h, w), painting.shaded(rng, (58, 70, 84), 0.3))
+    image *= (1 + 0.2 * painting.cloud(rng, (h, w), 0.4 / texel_m, 3, gain=0.7))[..., None]
+    curtain = painting.shaded(rng, painting.vivid(rng, 0.5), 0.1)
     side = round(rng.uniform(0.12, 0.38) * w)
     folds = (1 + 0.12 * np.sin(np.arange(w) * texel_m * 2 * np.pi / 0.09)).astype(np.float32)
     drape = (np.array(curtain, dtype=np.float32) * folds[:, None])[None]

@@ -6,6 +6,7 @@ import numpy as np
 
 from duagc.converters.simulate.scenes import drawn
 from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes import wood_textures as wooden
 from duagc.converters.simulate.scenes.scene import Flat, Lamp, Scene
 from duagc.pipeline.base import random_streams
 
@@ -63,7 +64,7 @@ def _shell(scene: Scene) -> None:
     west = tex.paint_onto(
         tex.plaster((146, 162, 178), 0.06),
         [
-            (tex.front((146, 108, 74), 1, 2), 1.0, 0.6, 0.9, 2.1),
+            (wooden.front((146, 108, 74), 1, 2), 1.0, 0.6, 0.9, 2.1),
             (drawn.picture("landscape"), 2.2, 0.55, 0.55, 0.75),
             (drawn.picture("abstract"), 3.05, 0.35, 1.0, 0.65),
             (drawn.picture("page"), 4.45, 0.55, 0.6, 0.75),
@@ -71,7 +72,7 @@ def _shell(scene: Scene) -> None:
             (tex.skirting, 1.9, h - 0.08, d - 1.9, 0.08),
         ],
     )
-    floor = tex.paint_onto(tex.planks(), [(tex.rug, 1.9, 1.75, 2.5, 1.9)])
+    floor = tex.paint_onto(wooden.planks(), [(tex.rug, 1.9, 1.75, 2.5, 1.9)])
     ceiling = tex.paint_onto(
         tex.plaster((222, 218, 206), 0.05),
         [(tex.lamp, 1.45, 2.35, 0.9, 0.9), (tex.lamp, 4.05, 2.35, 0.9, 0.9)],
@@ -85,7 +86,9 @@ def _shell(scene: Scene) -> None:
         Flat("west", west, h * z, y, -z, (d, h)),
     ]
     for k, beam in enumerate((0.8, 3.1, 5.4)):
-        scene.box(f"beam{k}", (beam, 0.0, h - 0.14), (0.16, d, 0.14), tex.wood((124, 84, 54)), shades=False)
+        scene.box(
+            f"beam{k}", (beam, 0.0, h - 0.14), (0.16, d, 0.14), wooden.wood((124, 84, 54)), shades=False
+        )
     for cx in (1.9, 4.5):
         scene.lamps.append(Lamp(np.array([cx, 2.8, h - 0.02]), 0.4 * x, 0.4 * y, 1.0))
     scene.lamps.append(Lamp(np.array([w - 0.02, 2.3, 1.65]), 0.65 * y, 0.5 * z, 0.8))
@@ -103,8 +106,8 @@ def _bookshelf(
     """Sides, boards and groups of books between them, open to the south."""
     x0, y0 = low
     board, shelves = 0.03, 5
-    oak = tex.wood((150, 106, 66))
-    scene.box("shelf/back", (x0, y0 + depth - 0.02, 0), (width, 0.02, height), tex.wood((112, 78, 50)))
+    oak = wooden.wood((150, 106, 66))
+    scene.box("shelf/back", (x0, y0 + depth - 0.02, 0), (width, 0.02, height), wooden.wood((112, 78, 50)))
     for side, x in (("west", x0), ("middle", x0 + (width - board) / 2), ("east", x0 + width - board)):
         scene.box(f"shelf/{side}", (x, y0, 0), (board, depth - 0.02, height), oak)
     bay = (width - 3 * board) / 2
@@ -160,10 +163,10 @@ def _sideboard(scene: Scene, rng: np.random.Generator) -> None:
         "sideboard",
         (3.05, 5.15, 0.08),
         (2.1, 0.45, 0.52),
-        tex.wood((176, 132, 86)),
-        front=tex.front((170, 126, 82), 4, 1),
+        wooden.wood((176, 132, 86)),
+        front=wooden.front((170, 126, 82), 4, 1),
     )
-    scene.legs("sideboard", (3.1, 5.2, 0.0), (2.0, 0.35, 0.08), tex.wood((80, 58, 42)), thick=0.06)
+    scene.legs("sideboard", (3.1, 5.2, 0.0), (2.0, 0.35, 0.08), wooden.wood((80, 58, 42)), thick=0.06)
     scene.box(
         "display", (3.5, 5.3, 0.68), (1.1, 0.06, 0.64), tex.plaster((38, 38, 42), 0.1), front=drawn.screen
     )
@@ -185,16 +188,16 @@ def _sideboard(scene: Scene, rng: np.random.Generator) -> None:
 
 def _desk(scene: Scene) -> None:
     """A desk at the east wall with a display, books and a lamp, and a chair turned away from it."""
-    top = tex.wood((190, 152, 106))
-    dark = tex.wood((92, 68, 50))
+    top = wooden.wood((190, 152, 106))
+    dark = wooden.wood((92, 68, 50))
     scene.box("desk", (5.65, 1.2, 0.71), (0.75, 1.7, 0.04), top)
     scene.legs("desk", (5.67, 1.24, 0.0), (0.70, 1.62, 0.71), dark, thick=0.06)
     scene.box(
         "desk/drawers",
         (5.75, 1.35, 0.2),
         (0.6, 0.42, 0.50),
-        tex.wood((176, 132, 86)),
-        left=tex.front((170, 126, 82), 1, 3),
+        wooden.wood((176, 132, 86)),
+        left=wooden.front((170, 126, 82), 1, 3),
     )
     scene.box(
         "monitor", (6.1, 1.85, 0.86), (0.05, 0.78, 0.46), tex.plaster((38, 38, 42), 0.1), left=drawn.screen
@@ -254,7 +257,7 @@ def _sofa(scene: Scene) -> None:
             yaw_rad=yaw,
             shades=False,
         )
-    scene.cylinder("side table", (4.55, 0.5, 0.0), tex.wood((132, 92, 60)), radius=0.26, height=0.5)
+    scene.cylinder("side table", (4.55, 0.5, 0.0), wooden.wood((132, 92, 60)), radius=0.26, height=0.5)
     scene.sphere("globe", (4.55, 0.5, 0.66), 0.16, tex.marbled((52, 96, 142), (176, 164, 96), 0.16))
     scene.cylinder("lamp/pole", (1.35, 0.4, 0.0), tex.plaster((70, 66, 62), 0.1), radius=0.03, height=1.3)
     scene.cylinder(
@@ -265,9 +268,9 @@ def _sofa(scene: Scene) -> None:
 def _low_table(scene: Scene) -> None:
     """A low table on the rug, slightly turned, with books and a bowl."""
     turn: dict[str, Any] = {"yaw_rad": 0.12, "about": (3.15, 2.8)}
-    scene.box("low table", (2.6, 2.5, 0.38), (1.1, 0.6, 0.045), tex.wood((136, 90, 56)), **turn)
+    scene.box("low table", (2.6, 2.5, 0.38), (1.1, 0.6, 0.045), wooden.wood((136, 90, 56)), **turn)
     scene.legs(
-        "low table", (2.63, 2.53, 0.0), (1.04, 0.54, 0.38), tex.wood((100, 66, 44)), thick=0.06, **turn
+        "low table", (2.63, 2.53, 0.0), (1.04, 0.54, 0.38), wooden.wood((100, 66, 44)), thick=0.06, **turn
     )
     pages = tex.plaster((206, 198, 178), 0.1)
     scene.box(
@@ -303,8 +306,8 @@ def _west_side(scene: Scene) -> None:
         "dresser",
         (0.0, 3.1, 0.0),
         (0.46, 1.3, 0.88),
-        tex.wood((188, 168, 136)),
-        right=tex.front((182, 160, 126), 3, 3),
+        wooden.wood((188, 168, 136)),
+        right=wooden.front((182, 160, 126), 3, 3),
     )
     scene.box(
         "dresser/books",
@@ -324,13 +327,13 @@ def _west_side(scene: Scene) -> None:
     scene.cylinder(
         "plant/pot", (0.45, 2.4, 0.0), tex.marbled((168, 96, 66), (120, 70, 52), 0.1), radius=0.2, height=0.4
     )
-    scene.cylinder("plant/stem", (0.45, 2.4, 0.4), tex.wood((96, 74, 50)), radius=0.03, height=0.3)
+    scene.cylinder("plant/stem", (0.45, 2.4, 0.4), wooden.wood((96, 74, 50)), radius=0.03, height=0.3)
     scene.sphere("plant/leaves", (0.45, 2.4, 0.98), 0.32, tex.foliage)
     scene.box(
         "crate",
         (0.12, 0.3, 0.0),
         (0.6, 0.45, 0.38),
-        tex.wood((160, 124, 84)),
+        wooden.wood((160, 124, 84)),
         yaw_rad=0.25,
         back=drawn.carton,
     )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes import painting
 from duagc.pipeline.base.arrays import Array
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -22,7 +22,7 @@ class Flat:
     """A rectangle p0 + s axis_s + t axis_t with 0 <= s <= size[0], 0 <= t <= size[1]; or the disc that fits in it."""
 
     name: str
-    material: tex.Material
+    material: painting.Material
     corner: Array
     axis_s: Array
     axis_t: Array
@@ -51,7 +51,7 @@ class Side:
     """The mantle of an upright cylinder; s runs around it, t down from its top."""
 
     name: str
-    material: tex.Material
+    material: painting.Material
     base: Array
     radius: float
     height: float
@@ -80,7 +80,7 @@ class Ball:
     """A sphere; s is longitude times radius, t is angle from the top times radius."""
 
     name: str
-    material: tex.Material
+    material: painting.Material
     center: Array
     radius: float
 
@@ -229,12 +229,12 @@ class Scene:
         name: str,
         low: ArrayLike,
         size: ArrayLike,
-        material: tex.Material,
+        material: painting.Material,
         *,
         yaw_rad: float = 0.0,
         about: ArrayLike | None = None,
         shades: bool = True,
-        **faces: tex.Material,
+        **faces: painting.Material,
     ) -> None:
         """Put a box.
 
@@ -275,7 +275,7 @@ class Scene:
                 self.surfaces.append(flat)
 
     def cylinder(
-        self, name: str, base: ArrayLike, material: tex.Material, *, radius: float, height: float
+        self, name: str, base: ArrayLike, material: painting.Material, *, radius: float, height: float
     ) -> None:
         """Put an upright cylinder with its lid.
 
@@ -293,7 +293,7 @@ class Scene:
         lid = base + height * UP - radius * x + radius * y
         self.surfaces.append(Flat(f"{name}/lid", material, lid, x, -y, (2 * radius, 2 * radius), round=True))
 
-    def sphere(self, name: str, center: ArrayLike, radius: float, material: tex.Material) -> None:
+    def sphere(self, name: str, center: ArrayLike, radius: float, material: painting.Material) -> None:
         """Put a sphere.
 
         Args:
@@ -307,7 +307,14 @@ class Scene:
         self.surfaces.append(Ball(name, material, center, radius))
 
     def legs(
-        self, name: str, low: ArrayLike, size: ArrayLike, material: tex.Material, *, thick: float, **turn: Any
+        self,
+        name: str,
+        low: ArrayLike,
+        size: ArrayLike,
+        material: painting.Material,
+        *,
+        thick: float,
+        **turn: Any,
     ) -> None:
         """Put four legs under a box; they cast no shadows.
 
