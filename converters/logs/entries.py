@@ -90,6 +90,28 @@ def sound_time(time_ns: int, where: str) -> int:
     return time_ns
 
 
+def time_of(entry: Entry, source: str, name: str) -> int:
+    """The time of a message by one of its clocks, ns.
+
+    Args:
+        entry: the message.
+        source: the clock, "header", "log" or "publish".
+        name: of the log.
+
+    Raises:
+        DuagError: the message has no such time, or none that can be computed with.
+    """
+    if source == "header":
+        return sound_time(entry.header_ns(), f"{name}: {entry.topic}")
+    if source == "log":
+        return entry.log_ns
+    if entry.publish_ns is None:
+        raise DuagError(
+            f"{name}: bags of ROS hold no times of publication, expected time_source=header or log"
+        )
+    return entry.publish_ns
+
+
 def raw_image(header: Any, pixels: NDArray[Any], encoding: str) -> SimpleNamespace:
     """An Image with ROS's fields.
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterator
 from functools import cached_property, partial
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
 from duagc.converters.layouts.ros_camera import RosCamera
 from duagc.converters.layouts.ros_images import is_integer_depth, size_of
-from duagc.converters.layouts.tum_layout import Listed, associate
 from duagc.converters.logs.cameras import (
     CameraWatch,
     as_stated,
@@ -24,14 +23,14 @@ from duagc.converters.logs.cameras import (
 from duagc.converters.logs.choice import Chooser
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
-from duagc.converters.logs.entries import Entry, sound_time
+from duagc.converters.logs.entries import Entry, time_of
 from duagc.converters.logs.files import Log, is_own_log
 from duagc.converters.logs.frames import TF_TYPES, Transforms, frame_name
 from duagc.converters.logs.gather import gathered
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.registration import ImageTopic, check_infos, check_samples, extrinsics
-from duagc.converters.logs.stamps import clock_words, eyes_apart, no_pairs, sound_stamps
+from duagc.converters.logs.stamps import clock_words, paired
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
@@ -140,7 +139,11 @@ class RobotLog:
         return T_frame_images @ se3.from_rotation_translation(turn, np.zeros(3))
 
     def depth_m(self, picture: Picture) -> Array:
-        """Depth [h, w] of a picture in meters, 0 = none."""
+        """Depth [h, w] of a picture in meters, 0 = none.
+
+        Args:
+            picture: of which the depth is wanted.
+        """
         if self.derived:
             return self.derived.depth_m(picture)
         assert picture.depth is not None
@@ -248,7 +251,11 @@ class RobotLog:
         return min([*self.pairs, *(depth for depth in depths if depth is not None)])
 
     def true_pose(self, stamp_ns: int | None) -> Array | None:
-        """T_world_camera [4, 4] of the camera of the recording at a time of the log; None where it is not known."""
+        """T_world_camera [4, 4] of the camera of the recording at a time of the log; None where it is not known.
+
+        Args:
+            stamp_ns: time of the log; None: not known.
+        """
         if self.truth is None or stamp_ns is None:
             return None
         T = self.truth.at(stamp_ns, self.settings.max_pose_gap_s)
@@ -257,17 +264,12 @@ class RobotLog:
     # --- which messages
 
     def time_ns(self, entry: Entry) -> int:
-        """The time of a message by the clock that the options choose."""
-        source = self.settings.time_source
-        if source == "header":
-            return sound_time(entry.header_ns(), f"{self.name}: {entry.topic}")
-        if source == "log":
-            return entry.log_ns
-        if entry.publish_ns is None:
-            raise DuagError(
-                f"{self.name}: bags of ROS hold no times of publication, expected time_source=header or log"
-            )
-        return entry.publish_ns
+        """The time of a message by the clock that the options choose.
+
+        Args:
+            entry: the message.
+        """
+        return time_of(entry, self.settings.time_source, self.name)
 
     @cached_property
     def _seen(self) -> dict[str, array[int]]:
@@ -327,48 +329,39 @@ class RobotLog:
         self._delays_ns -= np.rint(self._rate * (self._image_ns - self._origin_ns)).astype(np.int64)
 
     def written_ns(self, stamp_ns: int) -> int:
-        """The time of the recording for a time of the log: by the robot's clock as it was settled."""
+        """The time of the recording for a time of the log: by the robot's clock as it was settled.
+
+        Args:
+            stamp_ns: time of the log.
+        """
         return stamp_ns + self.shift_ns + round(self._rate * (stamp_ns - self._origin_ns))
 
     @cached_property
     def pairs(self) -> dict[int, int | None]:
         """Time of a color image -> time of its depth image; None: none is near, and the camera is followed by color."""
-        listed = {
-            topic: [Listed(t, Path()) for t in sound_stamps(self.name, topic, times, self.warnings)]
-            for topic, times in self._seen.items()
-        }
-        settings = self.settings
-        if settings.association == "all" and not settings.keeps_depth_time:  # nor can it be used twice
-            settings = settings.model_copy(update={"association": "official"})
-        found = associate(listed[self.color], listed[self.depth], settings)
-        if not found:
-            raise no_pairs(self.name, (self.color, self.depth), listed, settings)
-        pairs: dict[int, int | None] = {c.stamp_ns: d.stamp_ns for c, d in found}
-        alone = [c.stamp_ns for c in listed[self.color] if c.stamp_ns not in pairs]
-        kept = settings.keeps_depth_time
-        if alone:
-            end = "followed by color" if kept else "left out"
-            self.warnings.append(
-                f"{len(alone)} of {len(listed[self.color])} color images have no depth near in time; {end}"
-            )
-        if settings.depth_from == "stereo":
-            self.warnings += eyes_apart(
-                [(c.stamp_ns, d.stamp_ns) for c, d in found], (self.color, self.depth)
-            )
-        pairs |= dict.fromkeys(alone if kept else ())
+        topics, options = (self.color, self.depth), self.settings
+        pairs = paired(self.name, topics, self._seen, options, warnings=self.warnings)
         if min(pairs) + self.shift_ns < 0:
             raise DuagError(f"{self.name}: clock_offset_s = {self.settings.clock_offset_s} leads before 1970")
         return pairs
 
     def depth_stamp_ns(self, stamp_ns: int) -> int | None:
-        """The time of the recording for the depth of a color image; None: there is none, or it is that of the color."""
+        """The time of the recording for the depth of a color image; None: there is none, or it is that of the color.
+
+        Args:
+            stamp_ns: time of the color image in the log.
+        """
         depth_ns = self.pairs[stamp_ns]
         if depth_ns is None or not self.settings.keeps_depth_time:
             return None
         return self.written_ns(depth_ns)
 
     def clock(self, robot: str) -> RobotClock:
-        """What the times of the images say about the robot's clock."""
+        """What the times of the images say about the robot's clock.
+
+        Args:
+            robot: its name in the recording.
+        """
         first, last = min(self.pairs), max(self.pairs)
         header = self.settings.time_source == "header"
         files = frozenset(part.path for part in self.log.parts if self.color in part.topics)

@@ -1,12 +1,13 @@
-"""Times of the images of a topic in order of recording: what can be used of them."""
+"""Times of the images in order of recording: what can be used of them, and which belong together."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from duagc.converters.layouts.tum_layout import Listed, nearest_s
+from duagc.converters.layouts.tum_layout import Listed, associate, nearest_s
 from duagc.converters.logs.options import LogOptions
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.messages.parts import NANOSECONDS
@@ -69,6 +70,49 @@ def _check_steps_back(where: str, times: Sequence[int]) -> None:
             f"{where}: times go back by {back[worst] / NANOSECONDS:.3f} s to {known[worst] / NANOSECONDS:.3f} s, as "
             "of a clock that was set back; expected times in the order of recording, or --set time_source=log"
         )
+
+
+def paired(
+    name: str,
+    topics: tuple[str, str],
+    stamps: Mapping[str, Sequence[int]],
+    options: LogOptions,
+    *,
+    warnings: list[str],
+) -> dict[int, int | None]:
+    """Time of a color image -> time of its depth image; None: none is near, and the camera is followed by color.
+
+    Args:
+        name: of the log.
+        topics: of color and of depth.
+        stamps: times of the images by topic, ns, in order of recording.
+        options: of the conversion.
+        warnings: gets what was left out.
+
+    Raises:
+        DuagError: times cannot be used, or no image of depth is near one of color.
+    """
+    color, depth = topics
+    listed = {
+        topic: [Listed(t, Path()) for t in sound_stamps(name, topic, times, warnings)]
+        for topic, times in stamps.items()
+    }
+    if options.association == "all" and not options.keeps_depth_time:  # nor can it be used twice
+        options = options.model_copy(update={"association": "official"})
+    found = associate(listed[color], listed[depth], options)
+    if not found:
+        raise no_pairs(name, topics, listed, options)
+    pairs: dict[int, int | None] = {c.stamp_ns: d.stamp_ns for c, d in found}
+    alone = [c.stamp_ns for c in listed[color] if c.stamp_ns not in pairs]
+    kept = options.keeps_depth_time
+    if alone:
+        end = "followed by color" if kept else "left out"
+        warnings.append(
+            f"{len(alone)} of {len(listed[color])} color images have no depth near in time; {end}"
+        )
+    if options.depth_from == "stereo":
+        warnings += eyes_apart([(c.stamp_ns, d.stamp_ns) for c, d in found], topics)
+    return pairs | dict.fromkeys(alone if kept else ())
 
 
 def no_pairs(
