@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from duagc.converters.layouts.ros_images import UnusableImage, color_bytes
 from duagc.converters.layouts.ros_points import PointTimes, as_of, points_of
-from duagc.converters.layouts.stereo import RowCheck, StereoRig
+from duagc.converters.layouts.row_check import RowCheck
+from duagc.converters.layouts.stereo import StereoRig
 from duagc.converters.logs.entries import Entry
 from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.arrays import Array

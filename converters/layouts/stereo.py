@@ -5,7 +5,7 @@ Bouguet's rectification turns both cameras until corresponding points lie in one
 sigma_z = z^2 sigma_d / (f b). Everything here is OpenCV, arrays in and arrays out, for any converter:
 
     rig = StereoRig.of(left, right, T_right_left)
-    RowCheck().add(*pair) ... .result(where)        # refuses a calibration that is not that of the images
+    row_check.RowCheck().add(*pair) ... .result(where)  # refuses a calibration that is not that of the images
     color, depth_m, sigma_m = rig.rectify_left(image), *rig.depth(gray_left, gray_right)
 """
 
@@ -34,9 +34,6 @@ Image = NDArray[np.uint8]
 Depth = NDArray[np.float32]
 BLOCK_PX = 5
 SUBPIXELS = 16  # SGBM gives disparities in sixteenths
-MAX_ROW_PX = 1.0  # largest median row difference of matched features
-MIN_MATCHES = 50
-MATCH_RATIO = 0.8  # Lowe's, of the two best distances of descriptors
 SIGMA_OF_NOISE = 0.13  # disparity error x gradient / gray noise; of 5x5 blocks and their paths, measured
 LEAST_GRADIENT = 0.3  # gray values per px: below it is noise
 
@@ -251,7 +248,11 @@ class StereoRig:
         return self._rectify(image, 0)
 
     def rectify_right(self, image: Image) -> Image:
-        """A right image likewise."""
+        """A right image likewise.
+
+        Args:
+            image: [h, w] or [h, w, 3].
+        """
         return self._rectify(image, 1)
 
     def _rectify(self, image: Image, side: int) -> Image:
@@ -290,7 +291,12 @@ class StereoRig:
         )
 
     def disparity(self, left: Image, right: Image) -> Depth:
-        """Disparity [h, w], px, of rectified gray images; 0 where no match is certain."""
+        """Disparity [h, w], px, of rectified gray images; 0 where no match is certain.
+
+        Args:
+            left: gray, [h, w].
+            right: gray, [h, w].
+        """
         import cv2
 
         # the matcher leaves out as many columns as it tries disparities: give it those, and use no match in them
@@ -349,52 +355,3 @@ def disparity_sigma_m(
         focal_baseline: f b, px m.
     """
     return np.square(np.asarray(depth_m, dtype=np.float64)) * sigma_px / focal_baseline
-
-
-class RowCheck:
-    """Measures a rectification on the images themselves: matched features must lie in one row, and to the left."""
-
-    def __init__(self) -> None:
-        self._differences: list[Array] = [np.zeros((0, 2))]
-
-    def add(self, left: Image, right: Image) -> None:
-        """Match the features of a pair of rectified gray images, wherever in the image they are."""
-        import cv2
-
-        sift = cv2.SIFT.create(nfeatures=1000)
-        (points, ours), (others, theirs) = (sift.detectAndCompute(image, None) for image in (left, right))
-        if ours is None or theirs is None or len(others) < 2:
-            return
-        found = []
-        for best, second in cv2.BFMatcher().knnMatch(ours, theirs, k=2):
-            if best.distance < MATCH_RATIO * second.distance:
-                found.append(np.subtract(points[best.queryIdx].pt, others[best.trainIdx].pt))
-        self._differences.append(np.array(found).reshape(-1, 2))
-
-    def result(self, where: str) -> dict[str, Any]:
-        """Medians of the row difference (absolute, in pixels of the rectified image) and of the disparity.
-
-        Args:
-            where: begins the line of an error.
-
-        Raises:
-            DuagError: too few matches to judge, or rows or the order of the cameras do not fit.
-        """
-        columns, rows = np.concatenate(self._differences).T
-        if len(rows) < MIN_MATCHES:
-            raise DuagError(
-                f"{where}: {len(rows)} features of the left images found in the right ones, expected at least "
-                f"{MIN_MATCHES} to test the rectification"
-            )
-        row, disparity = float(np.median(np.abs(rows))), float(np.median(columns))
-        if row > MAX_ROW_PX:
-            raise DuagError(
-                f"{where}: matched features lie {row:.1f} px apart in rows (median of {len(rows)}), expected less than "
-                f"{MAX_ROW_PX:g}: the calibration is not that of these images"
-            )
-        if disparity <= 0:
-            raise DuagError(
-                f"{where}: matched features lie {-disparity:.1f} px to the right in the right images (median of "
-                f"{len(rows)}), expected to the left: the cameras are swapped"
-            )
-        return {"row_difference_px": row, "disparity_px": disparity, "matched_features": len(rows)}

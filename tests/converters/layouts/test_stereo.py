@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from duagc.converters.layouts.stereo import RawCamera, RowCheck, StereoOptions, StereoRig, disparity_sigma_m
+from duagc.converters.layouts.row_check import RowCheck
+from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig, disparity_sigma_m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
