@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from duagc.converters import registry
-from duagc.converters.datasets.s3e import read_fixes
+from duagc.converters.layouts.s3e_layout import read_fixes
 from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import so3
