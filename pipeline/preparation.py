@@ -28,7 +28,11 @@ Say = Callable[[str], None]
 
 
 def say(line: str) -> None:
-    """Say something on standard error."""
+    """Say something on standard error.
+
+    Args:
+        line: what is said.
+    """
     say_line(line)
 
 
