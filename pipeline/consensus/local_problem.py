@@ -9,6 +9,7 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import AdmmEdge
+from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
@@ -91,3 +92,14 @@ class LocalProblem:
             delta *= self._config.step_limit_rad / turn_rad
         self._moved_rad += float(np.abs(delta[:, 3:]).max())
         return delta
+
+
+def with_floor(odometry: RelativePoses, config: PoseConsensusConfig) -> RelativePoses:
+    """Odometry as the objective uses it: its covariance plus the floor of the settings.
+
+    Args:
+        odometry: factors between keyframes of one robot.
+        config: the floor, m and rad.
+    """
+    floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
+    return RelativePoses(odometry.i, odometry.j, odometry.T_i_j, add_covariance(odometry.information, floor))

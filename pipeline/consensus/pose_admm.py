@@ -22,7 +22,6 @@ Penalties are agreed between the two ends of a link: `admm_penalties`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
-from duagc.pipeline.consensus import admm_penalties
+from duagc.pipeline.consensus import admm_penalties, admm_weights
 from duagc.pipeline.consensus.admm_edge import (
     AdmmEdge,
     PosePacket,
@@ -39,11 +38,9 @@ from duagc.pipeline.consensus.admm_edge import (
     rounded,
     start_of_copies,
 )
-from duagc.pipeline.consensus.local_problem import LocalProblem
+from duagc.pipeline.consensus.local_problem import LocalProblem, with_floor
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.spd import add_covariance
-from duagc.pipeline.posegraph import least_squares
-from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, RobustWeights
+from duagc.pipeline.posegraph.gnc import RobustWeights
 from duagc.pipeline.posegraph.least_squares import retract
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
 
@@ -96,7 +93,11 @@ class PoseAgent:
     # ---- set-up ----
 
     def set_frame(self, T_world_map: ArrayLike) -> None:
-        """Start from this pose of the own map in the common frame; call before the first step."""
+        """Start from this pose of the own map in the common frame; call before the first step.
+
+        Args:
+            T_world_map: [4, 4].
+        """
         if self._started:
             raise ValueError(f"{self.robot}: the frame cannot change after the first step")
         self.T_world_map = np.array(T_world_map, dtype=np.float64)
@@ -192,7 +193,11 @@ class PoseAgent:
         return self.step_change
 
     def outgoing(self, peer: str) -> PosePacket:
-        """What to send to a neighbor after a step."""
+        """What to send to a neighbor after a step.
+
+        Args:
+            peer: name of the neighbor.
+        """
         if not self._started:
             self._start()
         link = self.links[peer]
@@ -211,7 +216,12 @@ class PoseAgent:
         )
 
     def receive(self, peer: str, packet: PosePacket) -> bool:
-        """Use a neighbor's packet; False if it was of another version or had nothing newer."""
+        """Use a neighbor's packet; False if it was of another version or had nothing newer.
+
+        Args:
+            peer: name of the neighbor.
+            packet: from its `outgoing`, whole or in part.
+        """
         if not self._started:
             self._start()
         link = self.links[peer]
@@ -266,19 +276,15 @@ class PoseAgent:
 
     def _weigh(self, link: AdmmEdge) -> None:
         """Robust weights of a link's loop closures, paced by what arrives on it."""
-        squared = partial(least_squares.squared_residuals, link.factors, self._x)
-        if link.robust.advance(link.received_total, link.is_steady(self.config.penalty_period), squared):
+        if admm_weights.advance_held(link, self._x, self.config):
             self._reweighted()
             if link.robust.scheduled:
                 link.reference, link.received = None, 0.0
 
     def _weigh_loops(self) -> None:
         """Robust weights of own loops, paced by the link on which least arrives."""
-        links = self.links.values()
-        squared = partial(least_squares.squared_residuals, self.loops, self._x)
-        received = min(link.received_total for link in links)
-        steady = all(link.is_steady(self.config.penalty_period) for link in links)
-        if self.loop_weights.advance(received, steady, squared):
+        links = list(self.links.values())
+        if admm_weights.advance_loops(self.loop_weights, self.loops, links, self._x, config=self.config):
             self._reweighted()
 
     def _reweighted(self) -> None:
@@ -286,23 +292,18 @@ class PoseAgent:
         self._collect_weights()
         groups = [self.loop_weights, *(link.robust for link in self.links.values())]
         if self.config.team_schedule().drop_idle:
-            self._drop_idle()
+            self.masks |= admm_weights.drop_idle(list(self.links.values()))
         if self._scheduled and not self._adapts and any(group.graduated for group in groups):
             self._adapts = True
             for link in self.links.values():
                 link.adapting_from = link.received_total
 
-    def _drop_idle(self) -> None:
-        """After its schedule, a link shares only the keyframes that loop closures with weight name."""
-        for link in self.links.values():
-            if link.holds and link.robust.scheduled:
-                carrying = link.carrying()
-                if not np.array_equal(carrying, link.active):
-                    link.activate(carrying, link.active_version + 1)
-                    self.masks[link.peer] = (link.active_version, carrying)
-
     def shared_with(self, peer: str) -> int:
-        """How many keyframes a link shares; zero if there is none."""
+        """How many keyframes a link shares; zero if there is none.
+
+        Args:
+            peer: name of the neighbor.
+        """
         return len(self.links[peer].keyframes) if peer in self.links else 0
 
     def take_mask(self, peer: str, version: int, active: NDArray[np.bool_]) -> None:
@@ -359,17 +360,22 @@ class PoseAgent:
         return self._x[: len(self.T_map_keyframe)].copy()
 
     def weights(self, peer: str) -> Array:
-        """Weight [m] of every loop closure held with a neighbor, in the order given."""
+        """Weight [m] of every loop closure held with a neighbor, in the order given.
+
+        Args:
+            peer: name of the neighbor.
+        """
         return self.links[peer].robust.weights.copy()
 
     def refuted(self, peer: str) -> bool:
         """Whether the loop closures held with a neighbor no longer connect it: final weights, too few of them inliers.
 
         It takes `closures.min_support` to connect two robots, and as many to keep them connected.
+
+        Args:
+            peer: name of the neighbor.
         """
-        link = self.links[peer]
-        kept = int(np.count_nonzero(link.robust.weights >= INLIER_WEIGHT))
-        return link.holds and link.robust.done and kept < self.config.closures.min_support
+        return admm_weights.refuted(self.links[peer], self.config.closures)
 
     def residuals(self) -> dict[str, Any]:
         """Residuals and state of a round, for the record.
@@ -391,9 +397,3 @@ class PoseAgent:
             },
             "factorizations": self._problem.factorizations,
         }
-
-
-def with_floor(odometry: RelativePoses, config: PoseConsensusConfig) -> RelativePoses:
-    """Odometry as the objective uses it: its covariance plus the floor of the settings."""
-    floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
-    return RelativePoses(odometry.i, odometry.j, odometry.T_i_j, add_covariance(odometry.information, floor))

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.consensus.local_problem import with_floor
 from duagc.pipeline.consensus.matching import without
-from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.consensus.weighting import in_world, self_information, shared_evidence
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.evaluation.results import Absent

@@ -31,7 +31,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import PosePacket, rounded
-from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.consensus.local_problem import with_floor
 from duagc.pipeline.exchange.matched_pairs import MatchedPairs, moved
 from duagc.pipeline.exchange.pose_solver import LinkStart, Matcher, SolverStart
 from duagc.pipeline.exchange.wire.algorithm_1_wire import read_means, read_pairs, write_means, write_pairs

@@ -25,8 +25,8 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import STEADY, PosePacket, rounded
+from duagc.pipeline.consensus.local_problem import with_floor
 from duagc.pipeline.consensus.own_block import minimized
-from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.exchange.pose_solver import LinkStart, SolverStart
 from duagc.pipeline.exchange.wire.block_descent_wire import ClosureWeights, read_message, write_message
 from duagc.pipeline.exchange.wire.link_setup_wire import LinkSetup

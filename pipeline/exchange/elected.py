@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
-from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.consensus.local_problem import with_floor
 from duagc.pipeline.exchange.pose_solver import LinkStart, SolverStart
 from duagc.pipeline.exchange.wire import elected_wire
 from duagc.pipeline.exchange.wire.elected_wire import AnswerPart, GraphPart

@@ -10,7 +10,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.elimination import Variable
-from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.consensus.local_problem import with_floor
 from duagc.pipeline.consensus.tree import TreeGraph, TreeNode
 from duagc.pipeline.exchange.pose_solver import LinkStart, SolverStart
 from duagc.pipeline.exchange.wire import elimination_wire

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
-from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.consensus.local_problem import with_floor
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.oracle import (
     NO_LISTS,

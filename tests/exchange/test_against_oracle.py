@@ -13,7 +13,7 @@ from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.consensus.local_problem import with_floor
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.evaluation.oracle import pose_gap, solve_component
 from duagc.pipeline.exchange.session import run_session_of
