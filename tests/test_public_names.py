@@ -1,7 +1,6 @@
-"""The names of the package: they exist, load late, and say what they take."""
+"""The names of the package: they exist, and load late."""
 
 import inspect
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,34 +9,6 @@ import pytest
 
 import duagc
 from tests.fixtures import fake_run
-
-FUNCTIONS_AND_CLASSES = sorted(name for name in duagc.__all__ if not inspect.ismodule(getattr(duagc, name)))
-
-
-def parameters_of(thing: object) -> list[str]:
-    """Parameters that a caller gives; of a class those of its own constructor."""
-    if inspect.isclass(thing):
-        if "__init__" not in vars(thing) or hasattr(thing, "__dataclass_fields__"):
-            return []
-        thing = thing.__init__
-    return [p for p in inspect.signature(thing).parameters if p != "self"]  # type: ignore[arg-type]
-
-
-def documentation_of(thing: object) -> str:
-    own = inspect.getdoc(thing) or ""
-    if inspect.isclass(thing) and "__init__" in vars(thing):
-        own += "\n" + (inspect.getdoc(thing.__init__) or "")
-    return own
-
-
-@pytest.mark.parametrize("name", FUNCTIONS_AND_CLASSES)
-def test_every_parameter_of_a_public_name_has_a_line_of_its_own(name: str) -> None:
-    thing = getattr(duagc, name)
-    text = documentation_of(thing)
-    assert text, f"duagc.{name} has no docstring"
-    documented = re.findall(r"^ {4,}(\w+): \S", text, re.MULTILINE)
-    missing = [p for p in parameters_of(thing) if p not in documented]
-    assert not missing, f"duagc.{name}: Args: lacks a line for {', '.join(missing)}"
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ def test_a_run_is_up_to_date_though_another_one_computed_one_of_its_stages_again
 def test_metrics_of_another_evaluation_are_replaced_with_a_warning(
     small_runs: Path, small_recording: Path, small_run: Path
 ) -> None:
-    out = small_runs / "measured_again"
+    out = small_runs / "measured_otherwise"
     shutil.copytree(small_run, out)
     (out / "metrics.json").write_text("{}")  # as `duagc evaluate --own-longer` writes it again
     (out / "run.rrd").unlink()

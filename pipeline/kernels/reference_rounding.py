@@ -22,7 +22,7 @@ UNSURE_PLACE = 1e-6  # depths and directions
 
 
 class RoundingReference(ReferenceRasterizer):
-    """The reference, which also tells of its last view where float32 may decide otherwise, and what cancels in sums."""
+    """The reference; it also gives, of its last view, where float32 may decide otherwise, and what cancels in sums."""
 
     def gate_margin(self) -> float:
         """Smallest relative distance of any pair of pixel and Gaussian from the thresholds of alpha and transmittance.
