@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+
+import numpy as np
 
 from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.registration import Registration, RgbdPyramid
+from duagc.pipeline.frontend.hidden_pixels import HiddenPixels
+from duagc.pipeline.registration import Level, Registration, RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract_from_pyramid
 
 
@@ -21,6 +24,9 @@ class CurrentFrame:
         pyramid: its images.
         relocalization: how its features are extracted.
         depth_offset_ns: how much later its depth was taken, wherever that was moved to.
+        hidden: what an object in front of the camera hides, which the images are without; None: nothing known.
+        whole: its coarsest image before.
+        suspected: what an object may hide, of a frame with whole images; None: nothing.
     """
 
     frame_index: int
@@ -28,6 +34,33 @@ class CurrentFrame:
     pyramid: RgbdPyramid
     relocalization: RelocalizationConfig
     depth_offset_ns: int = 0
+    hidden: HiddenPixels | None = None
+    whole: Level | None = None
+    suspected: HiddenPixels | None = None
+
+    @property
+    def seen(self) -> Level:
+        """Its coarsest image, without what is, or may be, an object in front of the camera."""
+        coarsest = self.pyramid.levels[-1]
+        if self.suspected is None:
+            return coarsest
+        depth = np.where(self.suspected.mask, np.float32(0), coarsest.inverse_depth)
+        return replace(coarsest, inverse_depth=depth)
+
+    def without(self, hidden: HiddenPixels) -> CurrentFrame:
+        """The frame without what an object hides.
+
+        Args:
+            hidden: by its coarsest image.
+        """
+        scale, finest = 2 ** (len(self.pyramid.levels) - 1), self.pyramid.levels[0].gray.shape
+        whole = hidden.mask.repeat(scale, axis=0).repeat(scale, axis=1)
+        # a last odd row or column is in no coarse pixel
+        whole = np.pad(
+            whole, [(0, full - part) for full, part in zip(finest, whole.shape, strict=True)], mode="edge"
+        )
+        coarsest = self.whole or self.pyramid.levels[-1]
+        return replace(self, pyramid=self.pyramid.masked(~whole), hidden=hidden, whole=coarsest)
 
     @cached_property
     def features(self) -> Features:

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FailureConfig
+from duagc.pipeline.frontend.hidden_pixels import HiddenPixels, carried
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.geometry.projection import FREE, free_space
 from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid
 
@@ -248,6 +250,9 @@ class OcclusionDetector:
     Attributes:
         active: whether an object came and has not been seen to be gone.
         occluded: whether the last view shows it.
+        unoccluded: the last view without an object, coarse, and its T_map_camera [4, 4].
+        shown: where the object was in the last view, bool [h, w], and the inverse depth of that view, [h, w], 1/m, both
+            of the coarsest image; None: it was not looked for, or is no more there.
     """
 
     def __init__(self, config: FailureConfig) -> None:
@@ -259,16 +264,16 @@ class OcclusionDetector:
         self.config = config
         self.active = False
         self.occluded = False
-        self._unoccluded: tuple[Level, Array] | None = (
-            None  # the last such view, coarse, and its T_map_camera
-        )
+        self.unoccluded: tuple[Level, Array] | None = None
+        self.shown: tuple[Mask, Image] | None = None
 
-    def update(self, view: Level, viewpoint: Viewpoint) -> None:
+    def update(self, view: Level, viewpoint: Viewpoint, seen: Level | None = None) -> None:
         """Take the next view that was tracked. An object is gone only when most of a view can be judged.
 
         Args:
             view: its coarsest image.
             viewpoint: where it was tracked.
+            seen: the image without what may be an object; None: the same.
         """
         self.occluded, visible = self.judge(view, viewpoint)
         if self.occluded:
@@ -276,7 +281,37 @@ class OcclusionDetector:
         elif visible >= self.config.min_visible * int(np.count_nonzero(view.inverse_depth)):
             self.active = False
         if not self.active:
-            self._unoccluded = view, viewpoint.T_map_keyframe @ viewpoint.T_keyframe_camera
+            self.shown = None
+        self._remember(seen or view, viewpoint)
+
+    def update_by(self, hidden: HiddenPixels, view: Level, viewpoint: Viewpoint, whole: Level) -> None:
+        """The same of a view in which the object was looked for.
+
+        Args:
+            hidden: by the object.
+            view: its coarsest image, without the pixels of the object.
+            viewpoint: where it was tracked.
+            whole: its coarsest image.
+        """
+        self.shown = hidden.mask, whole.inverse_depth
+        self.occluded = hidden.share > self.config.max_free_space_violations
+        self.active = self.occluded or (self.active and hidden.visible < self.config.min_visible)
+        self._remember(view, viewpoint)
+
+    def carry(self, view: Level, min_region: float) -> None:
+        """Follow the object into a view of a camera that is lost.
+
+        Args:
+            view: its coarsest image.
+            min_region: smallest object, as a share of the image.
+        """
+        if self.shown is not None:
+            mask = carried(*self.shown, view, min_region=min_region)
+            self.shown = (mask, view.inverse_depth) if mask.any() else None
+
+    def _remember(self, view: Level, viewpoint: Viewpoint) -> None:
+        if not self.active:
+            self.unoccluded = view, viewpoint.T_map_keyframe @ viewpoint.T_keyframe_camera
 
     def judge(self, view: Level, viewpoint: Viewpoint) -> tuple[bool, int]:
         """Whether too much of a view is in free space, and how many of its pixels could be judged.
@@ -287,8 +322,8 @@ class OcclusionDetector:
         """
         T_keyframe_camera = viewpoint.T_keyframe_camera
         found = [free_space_violations(view, viewpoint.keyframe, T_keyframe_camera, self.config)]
-        if self._unoccluded is not None:
-            before, T_map_before = self._unoccluded
+        if self.unoccluded is not None:
+            before, T_map_before = self.unoccluded
             T_before_camera = se3.inverse(T_map_before) @ viewpoint.T_map_keyframe @ T_keyframe_camera
             found.append(free_space_violations(view, before, T_before_camera, self.config))
         occluded = any(

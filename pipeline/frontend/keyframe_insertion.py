@@ -22,7 +22,7 @@ def insert_first_keyframe(state: TrackingState, frame: CurrentFrame, reference: 
         frame: the current frame.
         reference: its samples.
     """
-    shelved = SHELF.put((reference, frame.features, frame.pyramid.levels[-1]))
+    shelved = SHELF.put((reference, frame.features, frame.pyramid.levels[-1], frame.seen))
     state.keyframes.append(
         TrackedKeyframe(
             keyframe_index=len(state.keyframes),
@@ -33,6 +33,7 @@ def insert_first_keyframe(state: TrackingState, frame: CurrentFrame, reference: 
             reference=shelved[0],
             features=shelved[1],
             coarsest=shelved[2],
+            seen=shelved[3],
         )
     )
 
@@ -58,7 +59,7 @@ def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: PoseCand
     gain_before, offset_before = previous.exposure
     gain, offset = result.exposure
     reference = Reference.from_pyramid(frame.pyramid, state.config.tracking.strides)
-    shelved = SHELF.put((reference, frame.features, frame.pyramid.levels[-1]))
+    shelved = SHELF.put((reference, frame.features, frame.pyramid.levels[-1], frame.seen))
     state.keyframes.append(
         TrackedKeyframe(
             keyframe_index=new,
@@ -69,6 +70,7 @@ def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: PoseCand
             reference=shelved[0],
             features=shelved[1],
             coarsest=shelved[2],
+            seen=shelved[3],
             exposure=(gain * gain_before, gain * offset_before + offset),
         )
     )

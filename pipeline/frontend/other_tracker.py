@@ -262,5 +262,6 @@ class OtherTracker(ABC):
                 reference=reference,
                 features=features,
                 coarsest=coarsest,
+                seen=coarsest,
             )
         )

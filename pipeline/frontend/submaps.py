@@ -20,6 +20,7 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.current_frame import CurrentFrame
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
+from duagc.pipeline.frontend.hidden_pixels import HiddenPixels
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -171,8 +172,16 @@ class SubmapTracker:
         )
 
     def _track_candidate(self, frame: CurrentFrame, reason: Reason) -> None:
-        """Track a lost frame in the candidate, or begin a new one; make it the current submap once it is one."""
+        """Track a lost frame in the candidate, or begin a new one; make it the current submap once it is one.
+
+        It is without an object that was in front of the camera when it was lost, for as long as that is followed.
+        """
         at, limits = len(self._frames) - 1, self.config.submaps
+        shown = self._trackers[self._current].state.occlusion.shown
+        if shown is not None:
+            known = frame.pyramid.levels[-1].inverse_depth > 0
+            share = int(np.count_nonzero(known & shown[0])) / max(int(np.count_nonzero(known)), 1)
+            frame = frame.without(HiddenPixels(shown[0], share, visible=0.0))
         if self._candidate is not None:
             tracked = self._candidate.tracker.track_frame(frame)
             if tracked.status is Status.LOST:

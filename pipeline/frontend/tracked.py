@@ -102,6 +102,7 @@ class TrackedKeyframe:
         reference: samples that frames are registered to.
         features: by which a lost camera is relocalized here.
         coarsest: the coarsest image of its pyramid.
+        seen: the same without what may be an object in front of the camera.
         exposure: (gain, offset) of its gray values relative to keyframe 0.
     """
 
@@ -113,6 +114,7 @@ class TrackedKeyframe:
     reference: Reference = field(repr=False)
     features: Features = field(repr=False)
     coarsest: Level = field(repr=False)
+    seen: Level = field(repr=False)
     exposure: tuple[float, float] = (1.0, 0.0)
 
     @cached_property

@@ -24,7 +24,7 @@ from duagc.pipeline.frontend.frame_images import Image, RgbdImages
 from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
 from duagc.pipeline.frontend.keyframe_insertion import insert_first_keyframe, insert_keyframe
 from duagc.pipeline.frontend.missing_images import count_missing_image, follow_by_color, follow_by_depth
-from duagc.pipeline.frontend.nearby_registration import register_nearby
+from duagc.pipeline.frontend.occluded_frames import register_visible
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import TrackingState
@@ -169,25 +169,30 @@ class Tracker:
         missing = count_missing_image(state, frame)
         if missing is Reason.NONE and not state.keyframes:
             return self._initialize(frame)
-        found = self._locate(frame, missing)
+        frame, found = self._locate(frame, missing)
         tracked = self._mark_lost(frame, found) if isinstance(found, Reason) else self._accept(frame, found)
         return replace(tracked, repeats=True) if state.frozen.repeats else tracked
 
-    def _locate(self, frame: CurrentFrame, missing: Reason) -> PoseCandidate | Reason:
-        """Where a frame is, or why that is not known.
+    def _locate(self, frame: CurrentFrame, missing: Reason) -> tuple[CurrentFrame, PoseCandidate | Reason]:
+        """A frame, without what an object hides of it, and where it is, or why that is not known.
 
         Args:
             frame: the current frame.
             missing: which of its images cannot be used, if any.
         """
+        state = self.state
+        if missing is Reason.NONE and not state.is_long_lost(frame.stamp_ns):
+            return register_visible(state, frame)
+        return frame, self._locate_whole(frame, missing)
+
+    def _locate_whole(self, frame: CurrentFrame, missing: Reason) -> PoseCandidate | Reason:
+        """Where a frame is that is not registered near the last pose, or why that is not known."""
         if missing is Reason.NO_PIXEL:
             return missing
         if missing is Reason.FROZEN_COLOR:
             return follow_by_depth(self.state, frame)
         if missing is not Reason.NONE:
             return follow_by_color(self.state, frame, missing)
-        if not self.state.is_long_lost(frame.stamp_ns):
-            return register_nearby(self.state, frame)
         return self._relocalizer.locate(self.state, frame)
 
     def _initialize(self, frame: CurrentFrame) -> TrackedFrame:
@@ -218,6 +223,9 @@ class Tracker:
         """A frame without a pose: it keeps the last known one, with zero information."""
         self.state.lost = True
         self.state.recent = []
+        self.state.occlusion.carry(
+            frame.whole or frame.pyramid.levels[-1], self.state.config.moving.min_region
+        )
         return TrackedFrame(
             frame_index=frame.frame_index,
             stamp_ns=frame.stamp_ns,
@@ -279,8 +287,13 @@ class Tracker:
         """What is in front of the camera, by a frame with depth and color; and the last good frame."""
         state = self.state
         state.depth_color_inconsistent = False
-        state.occlusion.update(frame.pyramid.levels[-1], state.viewpoint(found))
-        if not (found.unlike or state.occlusion.active):
+        view, viewpoint = frame.pyramid.levels[-1], state.viewpoint(found)
+        if frame.hidden is None or frame.whole is None:
+            state.occlusion.carry(view, state.config.moving.min_region)
+            state.occlusion.update(view, viewpoint, frame.seen)
+        else:
+            state.occlusion.update_by(frame.hidden, view, viewpoint, frame.whole)
+        if not (found.unlike or (state.occlusion.active and frame.hidden is None)):
             state.last_good = LastGoodFrame(
                 frame.pyramid,
                 state.config.tracking.strides,
@@ -295,7 +308,7 @@ class Tracker:
             and self._is_near(frame.depth_offset_ns)
             and becomes_keyframe(found.result, frame.pyramid, self.state.config.keyframes)
             and self._is_well_exposed(frame.pyramid, found.result)
-            and self._is_unoccluded(found.result)
+            and (frame.hidden is not None or self._is_unoccluded(found.result))
         )
 
     def _is_unoccluded(self, result: Registration) -> bool:

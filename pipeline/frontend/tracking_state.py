@@ -146,6 +146,14 @@ class TrackingState:
         other = self.keyframes[candidate.keyframe_index].T_map_keyframe
         return se3.inverse(self.keyframe.T_map_keyframe) @ other @ T
 
+    def in_map(self, candidate: PoseCandidate) -> Array:
+        """T_map_camera [4, 4] of a pose that may be by another keyframe, as tracked.
+
+        Args:
+            candidate: the pose.
+        """
+        return self.keyframes[candidate.keyframe_index].T_map_keyframe @ candidate.result.T_reference_target
+
     def elapsed_s(self, stamp_ns: int) -> float:
         """Time since the last frame that was tracked, seconds.
 

@@ -137,6 +137,20 @@ class RgbdPyramid:
         g, o = np.float32(gain), np.float32(offset)
         return self._changed(lambda level: replace(level, gray=g * level.gray + o))
 
+    def masked(self, mask: masks.Mask) -> RgbdPyramid:
+        """The same without some more pixels.
+
+        Args:
+            mask: bool [h, w] of the finest level, pixels that may be used.
+        """
+        finest = self.levels[0]
+        usable = mask if finest.mask is None else finest.mask & mask
+        inverse_depth = np.where(usable, finest.inverse_depth, np.float32(0))
+        built = [replace(finest, inverse_depth=inverse_depth, mask=usable)]
+        while len(built) < len(self.levels):
+            built.append(built[-1].halved())
+        return RgbdPyramid(tuple(built))
+
     def _changed(self, change: Callable[[Level], Level]) -> RgbdPyramid:
         return RgbdPyramid(tuple(change(level) for level in self.levels))
 

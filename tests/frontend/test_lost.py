@@ -103,12 +103,16 @@ def test_a_hand_outside_the_keyframe_s_view_is_noticed(run: Undisturbed) -> None
     tracker = run.tracker(STARTS[0], config)
     *before, current = tracker.keyframes
     blind = replace(current.coarsest, inverse_depth=np.zeros_like(current.coarsest.inverse_depth))
-    tracker.state.keyframes = [*before, replace(current, coarsest=blind)]
+    tracker.state.keyframes = [*before, replace(current, coarsest=blind, seen=blind)]
     clear, *behind = list(d.hand(run.shots[STARTS[0] : STARTS[0] + 4], np.random.default_rng(0)))
     frame, _ = track(tracker, run.shots[clear.index])
     assert frame.keyframe_index == len(before) + 1  # every good frame becomes a keyframe here
-    tracker.keyframes[-1] = replace(tracker.keyframes[-1], coarsest=blind)
-    assert {track(tracker, shot)[0].keyframe_index for shot in behind} == {len(before) + 1}
+    tracker.keyframes[-1] = replace(tracker.keyframes[-1], coarsest=blind, seen=blind)
+    tracked = [track(tracker, shot)[0] for shot in behind]
+    assert all(frame.status is Status.OK for frame in tracked)
+    assert tracker.state.occlusion.active
+    for keyframe in tracker.keyframes[len(before) + 2 :]:
+        assert keyframe.reference.levels[0].points[:, 2].min() > 0.5  # the hand is 0.4 m away
 
 
 @pytest.mark.parametrize("start", sampled(STARTS))

@@ -8,7 +8,7 @@ import pytest
 
 from duagc.pipeline import registration
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
-from duagc.pipeline.frontend import nearby_registration, pose_checks
+from duagc.pipeline.frontend import feature_checks, nearby_registration
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
@@ -149,7 +149,7 @@ def test_features_are_not_asked_of_a_frame_that_looks_as_usual(
     def unexpected(*_: object) -> None:
         raise AssertionError("features were asked")
 
-    for module, name in ((nearby_registration, "initial_motions"), (pose_checks, "judge_motion")):
+    for module, name in ((nearby_registration, "initial_motions"), (feature_checks, "judge_motion")):
         monkeypatch.setattr(module, name, unexpected)
     assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
 
@@ -190,7 +190,7 @@ def test_a_camera_with_a_weak_prediction_and_few_features_is_followed_from_all_a
     predicted = replace(state.predict(frame.stamp_ns), sigma_px=5.0)
     monkeypatch.setattr(state, "predict", lambda stamp_ns: predicted)
     monkeypatch.setattr(nearby_registration, "initial_motions", lambda state, frame: iter(()))
-    monkeypatch.setattr(pose_checks, "features_agree", lambda *_: False)
+    monkeypatch.setattr(feature_checks, "features_agree", lambda *_: False)
     assert distance_m(run, state, nearby_registration.register_nearby(state, frame), start) < 2e-3
     monkeypatch.setattr(nearby_registration, "_from_all_around", lambda *_: None)
     assert nearby_registration.register_nearby(state, frame) is Reason.OBSTRUCTED

@@ -1,0 +1,176 @@
+"""Pixels of a view that show an object in front of the camera: what stands in space that earlier views saw to be free.
+
+A part of the object may be where no earlier view measured anything. So a connected surface is the object's as a whole
+if enough of it is in free space. It ends at steps of depth, and where earlier views saw the same surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.masks import Mask
+from duagc.pipeline.geometry.projection import FREE, ON_SURFACE, SAME_SURFACE, free_space
+from duagc.pipeline.registration import Level
+
+Image = NDArray[np.floating]
+
+COLUMNS = 80
+"""Columns of an image, or up to twice as many, that are looked at."""
+REACH = 1 / 16
+"""Of the width of an image, by which an object moves from one to the next."""
+
+
+@dataclass(frozen=True)
+class HiddenPixels:
+    """What an object hides of a view.
+
+    Attributes:
+        mask: bool [h, w] of the view's image: True where it shows the object, or touches it.
+        share: of the pixels of known depth, those that show it.
+        visible: of the pixels of known depth, the share whose place some earlier view measured.
+    """
+
+    mask: Mask
+    share: float
+    visible: float
+
+
+def hidden_pixels(
+    view: Level,
+    T_map_camera: Array,
+    seen: Iterable[tuple[Level, Array]],
+    config: FrontendConfig,
+) -> HiddenPixels:
+    """Find the object in a view.
+
+    Args:
+        view: its coarsest image.
+        T_map_camera: [4, 4], of the view.
+        seen: earlier views: their coarsest images, and T_map_camera [4, 4] of each.
+        config: of the front end. What registration takes for the same surface is not in free space; number of views
+            and smallest region are those of moving objects.
+    """
+    import cv2
+
+    step = max(1, view.inverse_depth.shape[1] // COLUMNS)
+    inverse_depth = view.inverse_depth[::step, ::step]
+    v, u = np.nonzero(view.inverse_depth)
+    kept = (v % step == 0) & (u % step == 0)
+    v, u, points_map = v[kept] // step, u[kept] // step, se3.transform(T_map_camera, view.points[kept])
+    seen, least = tuple(seen), config.moving.min_region * inverse_depth.size
+    some = (v % 2 == 0) & (u % 2 == 0)
+    votes = _votes(points_map[some], seen, config)
+    if np.count_nonzero(votes.is_free) >= least / 8:  # half as many as of a region that is large enough
+        votes = _votes(points_map, seen, config)
+    if np.count_nonzero(votes.is_free) < least:
+        return HiddenPixels(np.zeros(view.inverse_depth.shape, bool), 0.0, votes.visible)
+    is_free, is_surface = np.zeros(inverse_depth.shape, bool), np.zeros(inverse_depth.shape, bool)
+    is_free[v, u], is_surface[v, u] = votes.is_free, votes.is_surface
+    labels = _surfaces(inverse_depth, (inverse_depth > 0) & ~is_surface)
+    sizes, in_free_space = (
+        np.bincount(labels.ravel()),
+        np.bincount(labels[is_free], minlength=labels.max() + 1),
+    )
+    of_object = in_free_space > config.tracking.failure.max_free_space_violations * sizes
+    of_object[0] = False
+    found = _large(of_object[labels] | is_free, config.moving.min_region)
+    mask = cv2.dilate(found.view(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    height, width = view.inverse_depth.shape
+    whole = mask.repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
+    return HiddenPixels(whole, float(np.count_nonzero(found) / max(len(v), 1)), votes.visible)
+
+
+@dataclass(frozen=True)
+class _Votes:
+    """What earlier views say of points [n].
+
+    Attributes:
+        is_free: bool [n], whether enough of them, and most, saw free space there.
+        is_surface: bool [n], whether they saw a surface there.
+        visible: share of the points whose place some of them measured.
+    """
+
+    is_free: NDArray[np.bool_]
+    is_surface: NDArray[np.bool_]
+    visible: float
+
+
+def _votes(points_map: Array, seen: Sequence[tuple[Level, Array]], config: FrontendConfig) -> _Votes:
+    """What earlier views, as `hidden_pixels` takes them, say of points [n, 3] in the map, meters."""
+    n = len(points_map)
+    free, there, judged = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, bool)
+    for level, T_map_view in seen:
+        index, where = free_space(
+            se3.transform(se3.inverse(T_map_view), points_map),
+            level.nearest,
+            level.camera,
+            gate_m=config.tracking.registration.depth_gate_m,
+            gate_relative=config.tracking.registration.depth_gate_relative,
+        )
+        free[index] += where == FREE
+        there[index] += where == ON_SURFACE
+        judged[index] = True
+    is_free = (free >= config.moving.min_views) & (free > there)
+    return _Votes(is_free, (there > 0) & (free <= there), float(np.count_nonzero(judged) / max(n, 1)))
+
+
+def carried(before: Mask, inverse_depth_before: Image, view: Level, *, min_region: float) -> Mask:
+    """Where an object is in the view after one in which it was found, as far as depth follows it; [h, w].
+
+    Where the camera is does not matter: the object is what is at the same depth at the same pixels, and the surface
+    that is connected with it nearby.
+
+    Args:
+        before: bool [h, w], where it was.
+        inverse_depth_before: [h, w], 1/m, of that view, 0 = unknown.
+        view: the coarsest image of the next view.
+        min_region: smallest connected region, as a share of the image.
+    """
+    import cv2
+
+    now = view.inverse_depth
+    reach = 2 * max(1, round(REACH * now.shape[1])) + 1
+    near = cv2.dilate(before.view(np.uint8), np.ones((reach, reach), np.uint8)).astype(bool) & (now > 0)
+    same = before & near & (np.abs(now - inverse_depth_before) < SAME_SURFACE * now)
+    labels = _surfaces(now, near)
+    followed = np.zeros(labels.max() + 1, bool)
+    followed[labels[same]] = True
+    followed[0] = False
+    return _large(followed[labels], min_region)
+
+
+def _large(found: Mask, min_region: float) -> Mask:
+    """The connected regions of at least a share of the image."""
+    import cv2
+
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(found.view(np.uint8), connectivity=8)
+    large = statistics[:, cv2.CC_STAT_AREA] >= min_region * found.size
+    large[0] = False
+    return np.asarray(large[labels])
+
+
+def _surfaces(inverse_depth: Image, among: Mask) -> NDArray[np.int32]:
+    """Labels [h, w] of connected pixels between which depth makes no step; 0: not among those asked for."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    number = np.arange(among.size).reshape(among.shape)
+    ends: list[NDArray[np.int64]] = []
+    for here, there in (
+        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+    ):
+        one, other = inverse_depth[here], inverse_depth[there]
+        joined = among[here] & among[there] & (np.abs(one - other) < SAME_SURFACE * np.maximum(one, other))
+        ends.append(np.stack([number[here][joined], number[there][joined]]))
+    i, j = np.concatenate(ends, axis=1)
+    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(among.size, among.size))
+    _, labels = connected_components(graph, directed=False)
+    return np.where(among, labels.reshape(among.shape) + 1, 0).astype(np.int32)

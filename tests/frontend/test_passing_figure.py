@@ -1,0 +1,113 @@
+"""A figure that comes into the view slowly and passes: no keyframe contains it, and no pose follows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from duagc.pipeline.experiments.disturbed_tracking import WRONG_M, Undisturbed
+from duagc.pipeline.experiments.shots import Shot
+from duagc.pipeline.frontend.frame_images import RgbdImages
+from duagc.pipeline.frontend.hidden_pixels import carried, hidden_pixels
+from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
+from duagc.pipeline.frontend.tracked import Status
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import Level
+from tests.fixtures.films import CAMERA, FRAMES, filmed
+from tests.frontend.conftest import CONFIG
+
+ENTERS, PASSES = 20, 60  # frame at which it comes in; frames that it takes
+WIDTH = 0.3  # of the view
+SHAPE = (CAMERA.height, CAMERA.width)
+
+
+def passing(t: float) -> float:
+    """Left edge of a figure that crosses the view, in widths of the image, at time 0..1 of its stay."""
+    return -WIDTH + t * (1 + WIDTH)
+
+
+def visiting(t: float) -> float:
+    """The same of one that comes in, waits in the middle, and leaves where it came from."""
+    return -WIDTH + min(1.0, 3 * t, 3 - 3 * t) * (0.5 + 0.5 * WIDTH)
+
+
+def with_figure(shots: Sequence[Shot], left: Callable[[float], float], depth_m: float) -> Iterator[Shot]:
+    """Frames in which a blurred figure moves by itself."""
+    h, w = SHAPE
+    pattern = np.random.default_rng(3).integers(20, 236, (h // 24, 8, 3), dtype=np.uint8)
+    pattern = cv2.resize(pattern, (round(WIDTH * w), h), interpolation=cv2.INTER_CUBIC)
+    for shot in shots:
+        t = (shot.index - ENTERS) / PASSES
+        begin = round(w * left(t))
+        seen = slice(max(begin, 0), min(begin + pattern.shape[1], w))
+        if not 0 <= t <= 1 or seen.stop <= seen.start:
+            yield shot
+            continue
+        color, depth = shot.color.copy(), shot.depth.copy()
+        nearer = depth[:, seen] > depth_m
+        color[:, seen][nearer] = pattern[:, seen.start - begin : seen.stop - begin][nearer]
+        depth[:, seen][nearer] = depth_m
+        yield replace(shot, color=color, depth=depth, disturbed=bool(nearer.mean() > 0.5))
+
+
+def tracked(shots: Iterator[Shot]) -> TrackedLog:
+    tracker = SubmapTracker(CAMERA, CONFIG)
+    for shot in shots:
+        tracker.track(
+            RgbdImages(frame_index=shot.index, stamp_ns=shot.stamp_ns, image=shot.color, depth_m=shot.depth)
+        )
+    return tracker.finish()
+
+
+@pytest.mark.parametrize(("left", "depth_m"), [(passing, 0.9), (visiting, 0.8)])
+def test_poses_do_not_follow_a_figure(
+    run: Undisturbed, left: Callable[[float], float], depth_m: float
+) -> None:
+    log = tracked(with_figure(filmed(0, FRAMES), left, depth_m))
+    (submap,) = log.submaps
+    placed = [frame for frame in log.frames if frame.status is not Status.LOST]
+    assert len(placed) >= FRAMES - 3
+    for frame in placed:
+        T = submap.keyframes[frame.keyframe_index].T_map_keyframe @ frame.T_keyframe_camera
+        assert se3.distance(run.poses[frame.frame_index], T)[0] < WRONG_M
+    during = [k for k in submap.keyframes if ENTERS + 15 < k.frame_index < ENTERS + PASSES - 15]
+    assert during
+    for keyframe in during:  # whose samples are of the room
+        true = filmed(0, FRAMES)[keyframe.frame_index].depth
+        points = keyframe.reference.levels[0].points.astype(np.float64)
+        u, v = np.rint(CAMERA.project(points)).astype(int).T
+        assert (np.abs(points[:, 2] - true[v, u]) < 0.1).mean() > 0.97
+
+
+def level(depth_m: np.ndarray) -> Level:
+    camera = CAMERA.halved().halved().halved()
+    assert depth_m.shape == (camera.height, camera.width)
+    inverse = (1 / depth_m).astype(np.float32)
+    return Level(camera, np.zeros_like(inverse), inverse)
+
+
+def test_a_surface_is_an_object_as_a_whole_where_enough_of_it_is_in_free_space() -> None:
+    """Half of it is where the earlier view saw a wall, the other half where that view measured nothing."""
+    h, w = SHAPE[0] // 8, SHAPE[1] // 8
+    wall, now = np.full((h, w), 3.0), np.full((h, w), 3.0)
+    now[5:15, 8:20] = 1.0
+    before = level(wall)
+    before.inverse_depth[:, 14:] = 0
+    hidden = hidden_pixels(level(now), np.eye(4), [(before, np.eye(4))] * 2, CONFIG)
+    assert hidden.mask[5:15, 8:20].all()
+    assert hidden.share == pytest.approx(120 / (h * w))
+    still = hidden_pixels(before, np.eye(4), [(level(wall), np.eye(4))] * 2, CONFIG)
+    assert not still.mask.any()
+
+
+def test_an_object_is_carried_into_the_next_view_until_it_is_gone() -> None:
+    h, w = SHAPE[0] // 8, SHAPE[1] // 8
+    before, after = np.full((h, w), 3.0), np.full((h, w), 3.0)
+    before[5:15, 8:14] = after[5:15, 9:15] = 1.0
+    mask = carried(before < 2, 1 / before, level(after), min_region=0.002)
+    np.testing.assert_array_equal(mask, after < 2)
+    assert not carried(before < 2, 1 / before, level(np.full((h, w), 3.0)), min_region=0.002).any()
