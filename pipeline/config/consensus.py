@@ -29,6 +29,9 @@ class LoopClosureConfig(Config):
     (`docs/explanation/pose-consensus.md`)."""
     min_support: int = Field(default=2, ge=1)
     """Loop closures that must agree before two robots are put into one frame: one alone cannot be checked."""
+    min_alike: float = Field(default=0.65, ge=0.0, le=1.0)
+    """Share of the texture seen by both views that must look alike in one of them at least: a thing that stands in two
+    rooms has features enough to be taken for one place, and only what is around it distinguishes the rooms."""
     frame_sigma_m: float = Field(default=0.1, gt=0.0)
     """Scale of the Cauchy weights of the relative frame, translation."""
     frame_sigma_rad: float = Field(default=0.05, gt=0.0)

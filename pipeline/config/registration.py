@@ -90,9 +90,6 @@ class GeometricVerificationConfig(Config):
     min_covered: float | None = Field(default=None, gt=0.0, le=1.0)
     """Share of its own image in which a view must see samples of the other one for less overlap to be enough: a camera
     that stands nearer sees few of them, and nothing else. None: no share is enough."""
-    min_alike: float = Field(default=0.65, ge=0.0, le=1.0)
-    """Share of the texture that both views see which must look alike: a thing that stands in two rooms has features
-    enough to be taken for one place, and only what is around it distinguishes the rooms."""
     max_disagreement_m: float = Field(default=0.03, gt=0.0)
     """Largest distance between the registrations in the two directions, where both views' images are at hand. As the
     limit below, it grows with the median depth beyond 6 m."""

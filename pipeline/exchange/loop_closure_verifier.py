@@ -235,14 +235,16 @@ class Verifier(LoopClosureProtocol):
         self.tried = without_moved_things(self.tried, own, self.peer_keyframes, agreeing)
         self.tried.sort(key=lambda t: (t.candidate.peer_keyframe, t.candidate.own_keyframe))
         closures, consistency = self._consistency()
-        outcomes = iter(zip(consistency.keep.tolist(), consistency.reasons, strict=True))
+        found = consistency.keep.tolist(), consistency.unlike.tolist(), consistency.reasons
+        outcomes = iter(zip(*found, strict=True))
         for at, t in enumerate(self.tried):
             if t.result.closure is not None:
-                keep, reason = next(outcomes)
+                keep, unlike, reason = next(outcomes)
                 if not keep:
                     if t.result.detail == injection.DETAIL:
                         reason = f"{reason}; {injection.DETAIL}"
-                    result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
+                    verdict = Verdict.LOOKS_DIFFERENT if unlike else Verdict.INCONSISTENT
+                    result = replace(t.result, verdict=verdict, detail=reason)
                     self.tried[at] = Tried(t.candidate, result)
         if consistency.T_ownmap_peermap is not None:
             groups = (Group(consistency.keep, consistency.T_ownmap_peermap), *consistency.others)

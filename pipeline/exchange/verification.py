@@ -38,12 +38,12 @@ class Verdict(Enum):
     FEW_MATCHES = "too few matches between all features of the two keyframes"
     FEW_INLIERS = "too few matches agree on one motion"
     NOT_REGISTERED = "registration of the two views failed"
-    LOOKS_DIFFERENT = "what both views see looks different"
     MOVED = "registration moved far from the motion of the matches"
     SOMETHING_MOVED = "shows something that moved between the recordings"
     OUTWEIGHED = "lost its weight in the pose consensus"
     ALONE = "kept its weight, but too few others of this pair of robots did"
     UNDECIDED = "other links of the team contradict it, and it is open which are false"
+    LOOKS_DIFFERENT = "what both views see looks different, as in all that agree with it"
     INCONSISTENT = "disagrees with the other loop closures of this pair of robots"
 
 
@@ -145,7 +145,8 @@ def _judged(candidate: Candidate, found: GeometricVerification, config: Verifica
     verdict, detail = _VERDICTS[found.failure], _detail(found)
     closure = tentative = None
     if found.failure is None:
-        closure = LoopClosure(*candidate.ends, found.T_first_second, _certainty(found.information, config))
+        information = _certainty(found.information, config)
+        closure = LoopClosure(*candidate.ends, found.T_first_second, information, alike=found.alike)
     elif found.features.T_first_second is not None and found.features.accepted:
         certainty = _certainty(found.features.information, config)
         tentative = LoopClosure(*candidate.ends, found.features.T_first_second, certainty)
@@ -200,7 +201,6 @@ _VERDICTS = {
     Failure.FEW_INLIERS: Verdict.FEW_INLIERS,
     Failure.NOT_REGISTERED: Verdict.NOT_REGISTERED,
     Failure.LOW_OVERLAP: Verdict.NOT_REGISTERED,
-    Failure.LOOKS_DIFFERENT: Verdict.LOOKS_DIFFERENT,
     Failure.DIRECTIONS_DISAGREE: Verdict.NOT_REGISTERED,
     Failure.FAR_FROM_FEATURES: Verdict.MOVED,
 }
@@ -218,8 +218,6 @@ def _detail(found: GeometricVerification) -> str:
         return f"registration: {result.outcome.value}"
     if found.failure is Failure.FAR_FROM_FEATURES:
         return f"by {found.correction_m:.3f} m and {found.correction_rad:.3f} rad"
-    if found.failure is Failure.LOOKS_DIFFERENT:
-        return f"{found.alike:.0%} of the common texture look alike"
     if found.failure is not None:
         return f"registration: {found.failure.value}"
     return f"refined by {found.correction_m:.4f} m, {found.correction_rad:.4f} rad"

@@ -167,7 +167,7 @@ def _verified(
         verified = verify(view(one), view(other), limits, registration=registration, rng=rng, both=True)
         place, moved = verified.of_place, verified.of_moved
         if place.failure is None:
-            closures.append(LoopClosure(i, j, place.T_first_second, place.information))
+            closures.append(LoopClosure(i, j, place.T_first_second, place.information, alike=place.alike))
         if place.features.T_first_second is None or not place.features.accepted:
             continue
         by_features = LoopClosure(i, j, place.features.T_first_second, place.features.information)

@@ -7,7 +7,7 @@ closures. The graduated weights of `duagc.pipeline.consensus.pose_admm` may acce
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,7 @@ class Consistency:
         reasons: one per loop closure, in words.
         support: size of the group.
         others: smaller groups, disjoint, largest first.
+        unlike: bool [m], those of groups that never look alike.
     """
 
     keep: NDArray[np.bool_]
@@ -63,6 +64,7 @@ class Consistency:
     reasons: tuple[str, ...]
     support: int
     others: tuple[Group, ...] = ()
+    unlike: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,8 @@ def consistent(
 
     Two loop closures k and l are consistent if the relative frames of the two maps that each implies agree within the
     variance of both and of both robots' odometry between them, where they overlap: that is the error of the
-    cycle own k -> peer k -> peer l -> own l.
+    cycle own k -> peer k -> peer l -> own l. A group counts only if what both views see looks alike in one of them at
+    least: it does not where one thing stands in two places.
 
     Args:
         closures: all of one pair, from the side of one end.
@@ -138,23 +141,33 @@ def consistent(
         closure_variance,
         margin=config.margin,
     )
-    keep = _clique(agree)
-    support = int(keep.sum())
-    if support < config.min_support:
-        reason = f"largest consistent group has {support} of {m} loop closures, needs {config.min_support}"
-        return Consistency(np.zeros(m, dtype=bool), None, (reason,) * m, support)
-    rejected = f"disagrees with the consistent group of {support} among {m} loop closures"
-    reasons = tuple("consistent" if k else rejected for k in keep.tolist())
-    others: list[Group] = []
-    left = ~keep
-    while len(others) < _OTHER_GROUPS and np.count_nonzero(left) >= config.min_support:
+    alike, unlike, left = np.array([c.alike for c in closures]), np.zeros(m, bool), np.ones(m, bool)
+    groups: list[NDArray[np.bool_]] = []
+    largest, differs = 0, ""
+    while len(groups) <= _OTHER_GROUPS and left.any():
         group = np.zeros(m, dtype=bool)
         group[np.flatnonzero(left)[_clique(agree[np.ix_(left, left)])]] = True
+        largest = max(largest, int(group.sum()))
         if group.sum() < config.min_support:
             break
-        others.append(Group(group, robust_frame(frames[group], config)))
         left &= ~group
-    return Consistency(keep, robust_frame(frames[keep], config), reasons, support, tuple(others))
+        if (best := alike[group].max()) >= config.min_alike:
+            groups.append(group)
+        else:
+            unlike |= group
+            differs = f"at most {best:.0%} of the common texture look alike, {config.min_alike:.0%} needed"
+    if not groups:
+        few = f"largest consistent group has {largest} of {m} loop closures, needs {config.min_support}"
+        reasons = tuple(differs if u else few for u in unlike.tolist())
+        return Consistency(np.zeros(m, dtype=bool), None, reasons, largest, unlike=unlike)
+    keep, *smaller = groups
+    rejected = f"disagrees with the consistent group of {int(keep.sum())} among {m} loop closures"
+    reasons = tuple(
+        "consistent" if k else differs if u else rejected
+        for k, u in zip(keep.tolist(), unlike.tolist(), strict=True)
+    )
+    others = tuple(Group(group, robust_frame(frames[group], config)) for group in smaller)
+    return Consistency(keep, robust_frame(frames[keep], config), reasons, int(keep.sum()), others, unlike)
 
 
 def plausible(

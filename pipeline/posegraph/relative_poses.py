@@ -166,6 +166,7 @@ class LoopClosure:
         T_own_peer: [4, 4], coordinates of the peer's keyframe to those of the own one.
         information: [6, 6], right tangent (translation, rotation) of the measured motion, 1/m^2 and 1/rad^2.
         measured_from_peer: the measured motion is T_peer_own, otherwise T_own_peer.
+        alike: share of the texture that both keyframes see that looks alike, known to who verified it.
     """
 
     own_keyframe: int
@@ -173,13 +174,14 @@ class LoopClosure:
     T_own_peer: Array
     information: Array
     measured_from_peer: bool = False
+    alike: float = 1.0
 
     def reversed(self) -> LoopClosure:
         """The same measurement from the peer's side."""
         T_peer_own = se3.inverse(self.T_own_peer)
-        return LoopClosure(
-            self.peer_keyframe, self.own_keyframe, T_peer_own, self.information, not self.measured_from_peer
-        )
+        ends = self.peer_keyframe, self.own_keyframe
+        turned = not self.measured_from_peer
+        return LoopClosure(*ends, T_peer_own, self.information, turned, alike=self.alike)
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,6 @@ class Failure(Enum):
     FEW_INLIERS = "few_inliers"
     NOT_REGISTERED = "not_registered"
     LOW_OVERLAP = "low_overlap"
-    LOOKS_DIFFERENT = "looks_different"
     DIRECTIONS_DISAGREE = "directions_disagree"
     FAR_FROM_FEATURES = "far_from_features"
 
@@ -80,7 +79,7 @@ class GeometricVerification:
             whichever is less; 0 before it.
         correction_rad: the same for the rotation.
         another: of the other motion, if features agree on two.
-        alike: share of the texture that both views see that looks alike, where that is too little.
+        alike: share of the texture that both views see that looks alike; 1 before the registration.
     """
 
     failure: Failure | None
@@ -171,8 +170,6 @@ def _verified(
             return failed(Failure.NOT_REGISTERED, one.result)
     if not all(one.shares_enough for one in measured):
         return failed(Failure.LOW_OVERLAP, result)
-    if (alike := min(one.alike for one in measured)) < config.min_alike:
-        return replace(failed(Failure.LOOKS_DIFFERENT, result), alike=alike)
     apart_m, apart_rad = se3.distance(T, measured[-1].T_first_second)
     reach = reach_factor(max(view.median_depth_m for view in views))
     if apart_m > config.max_disagreement_m * reach or apart_rad > config.max_disagreement_rad:
@@ -181,9 +178,15 @@ def _verified(
     at_features = se3.transform(T, found.points) - se3.transform(guess, found.points)
     moved_m = min(moved_m, float(np.mean(np.linalg.norm(at_features, axis=-1))))
     far = moved_m > config.max_refinement_m * reach or moved_rad > config.max_refinement_rad
-    failure = Failure.FAR_FROM_FEATURES if far else None
     return GeometricVerification(
-        failure, found, result, T, information, correction_m=moved_m, correction_rad=moved_rad
+        Failure.FAR_FROM_FEATURES if far else None,
+        found,
+        result,
+        T,
+        information,
+        correction_m=moved_m,
+        correction_rad=moved_rad,
+        alike=min(one.alike for one in measured),
     )
 
 

@@ -2,6 +2,7 @@
 
 import time
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,6 +57,27 @@ def test_the_consistent_group_is_found_among_outliers():
     assert meters < 0.02
     assert radians < 0.01
     assert [reason == "consistent" for reason in found.reasons] == truth.tolist()
+
+
+def test_a_group_that_nowhere_looks_alike_does_not_count():
+    """One thing in two places: more loop closures agree on it than on the place."""
+    closures, own, peer, grown, truth, T_own_peer = pair(0, good=4, bad=6, aliased=8)
+    limit = CONFIG.min_alike
+    aliased = np.arange(len(closures)) >= 10
+    unlike = [
+        replace(c, alike=limit - 0.1) if thing else c for c, thing in zip(closures, aliased, strict=True)
+    ]
+    found = agreeing(unlike, own, peer, grown)
+    np.testing.assert_array_equal(found.keep, truth)
+    np.testing.assert_array_equal(found.unlike, aliased)
+    assert "55% of the common texture look alike, 65% needed" in found.reasons[-1]
+    assert se3.distance(found.T_ownmap_peermap, T_own_peer)[0] < 0.02
+    unlike[-1] = closures[-1]  # one view is enough
+    assert agreeing(unlike, own, peer, grown).keep.tolist() == aliased.tolist()
+    only = [replace(c, alike=limit - 0.1) for c in closures]
+    alone = agreeing(only, own, peer, grown)
+    assert alone.T_ownmap_peermap is None
+    assert alone.unlike[truth].all()
 
 
 def test_the_group_does_not_depend_on_the_order_or_the_end():
