@@ -24,6 +24,23 @@ def start_resource_tracker() -> None:
 
 
 @contextmanager
+def held_back() -> Iterator[None]:
+    """Stopping waits meanwhile; a process that is started meanwhile begins so, until `leave_to_parent`."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def leave_to_parent() -> None:
+    """In a process of ours: leave what a terminal sends to all processes to the one that started this one."""
+    for stop in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(stop, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+
+
+@contextmanager
 def ending_as_interrupts() -> Iterator[None]:
     """Take the signals of ENDING for Ctrl-C meanwhile, unless they are ignored, as nohup does."""
     here = threading.current_thread() is threading.main_thread()  # no other one may handle signals

@@ -8,7 +8,6 @@ import multiprocessing.util
 import os
 import pickle
 import resource
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.stop_signals import STOPPING, start_resource_tracker
+from duagc.pipeline.base.stop_signals import held_back, leave_to_parent, start_resource_tracker
 
 LOW_PRIORITY = 10
 """Nice value of what can wait: a tenth of a processor is left to it next to a task that cannot."""
@@ -85,12 +84,9 @@ def start_now(pool: ProcessPoolExecutor, workers: int) -> None:
         pool: of `worker_pool`.
         workers: how many it has.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
-    try:
+    with held_back():
         for _ in range(workers):
             pool.submit(_nothing)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _nothing() -> None:
@@ -98,9 +94,7 @@ def _nothing() -> None:
 
 
 def _begin(handed_down: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
-    for stop in (signal.SIGINT, signal.SIGHUP):  # of a terminal, which reach the parent as well
-        signal.signal(stop, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+    leave_to_parent()
     threading.Thread(target=end_with_parent, daemon=True).start()
     multiprocessing.util.Finalize(None, _end, exitpriority=LAST)
     # what it is of is imported here, and not before Ctrl-C is the parent's

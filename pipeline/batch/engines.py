@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import threading
 from collections.abc import Mapping
 from multiprocessing.connection import wait
@@ -13,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol
 
-from duagc.pipeline.base.stop_signals import STOPPING, start_resource_tracker
+from duagc.pipeline.base.stop_signals import held_back, leave_to_parent, start_resource_tracker
 from duagc.pipeline.base.workers import end_with_parent
 from duagc.pipeline.batch.cell import enter
 from duagc.pipeline.batch.clusters import RayEngine, SlurmEngine
@@ -75,11 +74,8 @@ class LocalEngine:
         process = multiprocessing.get_context("spawn").Process(
             target=_begin, args=(dict(arguments), self._shares[slot])
         )
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # inherited, until it has begun
-        try:
+        with held_back():
             process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self._running[name] = (process, slot)
 
     def wait(self) -> str:
@@ -108,8 +104,6 @@ def engine_of(name: str, slots: int, out: Path) -> LocalEngine | SlurmEngine | R
 
 
 def _begin(arguments: dict[str, str], processors: tuple[int, ...]) -> None:
-    for stop in (signal.SIGINT, signal.SIGHUP):  # of a terminal, which reach the parent as well
-        signal.signal(stop, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+    leave_to_parent()
     threading.Thread(target=end_with_parent, daemon=True).start()
     enter(arguments, processors)

@@ -199,7 +199,7 @@ class _Measured:
         T_first_second: [4, 4], by it.
         information: [6, 6] of the right tangent of T_first_second.
         shares_enough: whether the views share enough there.
-        alike: share of the texture that both see that looks alike there.
+        alike: share of the texture that both see that looks alike there; 0 where registration failed.
     """
 
     result: Registration
@@ -224,7 +224,7 @@ def _registered(
         forward = register(first.reference, target, T_first_second, registration)
         enough = _shares_enough(forward, first.reference, target, config)
         T = forward.T_reference_target
-        alike = share_alike(first.reference, target, T)
+        alike = share_alike(first.reference, target, T) if forward.ok else 0.0
         measured.append(_Measured(forward, T, forward.information, enough, alike))
     if second.reference is not None and first.images is not None:
         target = first.images()
@@ -232,7 +232,7 @@ def _registered(
         enough = _shares_enough(backward, second.reference, target, config)
         T_second_first = backward.T_reference_target
         information = se3.inverse_information(T_second_first, backward.information)
-        alike = share_alike(second.reference, target, T_second_first)
+        alike = share_alike(second.reference, target, T_second_first) if backward.ok else 0.0
         measured.append(_Measured(backward, se3.inverse(T_second_first), information, enough, alike))
     return measured
 
