@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 FOLDER = "MPLCONFIGDIR"
+BACKEND = "MPLBACKEND"
 
 
 def matplotlib() -> ModuleType:
     """The library, with a folder for what it knows of fonts.
 
     Without one that it may write, every process would make one more in the temporary folder, and print lines about it.
+    The environment may name a backend that the library does not know; it is left out, for figures need none.
     """
     if FOLDER not in os.environ and not _is_own(_usual_folder()):
         shared = Path(tempfile.gettempdir()) / f"duagc-matplotlib-{os.getuid()}"
         if _is_own(shared):
             os.environ[FOLDER] = str(shared)  # also of the processes that this one starts
-    import matplotlib as library
-
+    if "matplotlib" in sys.modules:
+        return sys.modules["matplotlib"]
+    backend = os.environ.pop(BACKEND, "")  # the import would fail for a name that it does not know
+    try:
+        import matplotlib as library
+    finally:
+        if backend:
+            os.environ[BACKEND] = backend
+    if backend:
+        with suppress(ValueError):
+            library.rcParams["backend"] = backend
     return library
 
 

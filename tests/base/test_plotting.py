@@ -32,7 +32,7 @@ def test_figures_ignore_what_a_user_has_set(tmp_path: Path) -> None:
     usual = drawn(tmp_path).stdout
     assert "<svg" in usual
     (tmp_path / "matplotlibrc").write_text("xtick.direction: in\nfont.size: 20\npatch.linewidth: 9\n")
-    assert drawn(tmp_path).stdout == usual
+    assert drawn(tmp_path, MPLBACKEND="of nobody").stdout == usual
 
 
 def test_a_user_who_may_write_no_home_has_one_folder_and_no_line(tmp_path: Path) -> None:
