@@ -69,6 +69,13 @@ class KeyframeDatabase:
                     self._coarse_depths.append(depth_m)
         return self._features
 
+    @property
+    def coarse_depths(self) -> list[NDArray[np.float32]]:
+        """Depth of every keyframe at low resolution, meters; found together with the features."""
+        if self._features is None:
+            _ = self.features
+        return self._coarse_depths
+
     def _all_seen(self, keyframes: range) -> list[tuple[Features, NDArray[np.float32]]]:
         """Features of keyframes, and their depth at low resolution; by threads."""
         return list(in_order(self._seen, map(self.data.images, keyframes)))
@@ -105,9 +112,8 @@ class KeyframeDatabase:
         Returns:
             Share of the samples that own keyframes see at the same place, 0 to 1.
         """
-        assert len(self.features) == len(self._coarse_depths)  # which reads the images
         return surface_agreement(
-            self._coarse_depths,
+            self.coarse_depths,
             self.data.camera,
             samples,
             T_ownmap_keyframe=self.graph.T_first_keyframe,
@@ -129,7 +135,7 @@ class KeyframeDatabase:
         """
         return overlaps(
             closures,
-            self._coarse_depths,
+            self.coarse_depths,
             self.data.camera,
             peer_camera,
             own=self.graph.from_first,

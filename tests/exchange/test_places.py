@@ -1,6 +1,7 @@
 """Recognizing places and verifying closures on rendered views of a known room."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from duagc.pipeline.config.exchange import (
     VerificationConfig,
 )
 from duagc.pipeline.config.registration import RegistrationConfig
-from duagc.pipeline.exchange import place_recognition
+from duagc.pipeline.exchange import keyframe_database, place_recognition
 from duagc.pipeline.exchange.keyframe_database import KeyframeDatabase
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify, within_view
@@ -34,6 +35,20 @@ def robots(make_robot: Any) -> dict[str, tuple[KeyframeDatabase, np.ndarray]]:
         data, truth = make_robot(name, turn, keyframes=3, gaussians=10)
         out[name] = (KeyframeDatabase(data, ExchangeConfig()), truth)
     return out
+
+
+def test_own_depth_is_read_where_it_is_asked_first(
+    robots: dict[str, tuple[KeyframeDatabase, np.ndarray]],
+) -> None:
+    """Also where Python leaves out what is only asserted (`python -O`)."""
+    (known, _), (peer, _) = robots["alpha"], robots["bravo"]
+    module = {"__name__": keyframe_database.__name__}
+    exec(compile(Path(keyframe_database.__file__).read_text(), "", "exec", optimize=1), module)
+    samples = [peer.sample(0).features.points]
+    poses = known.data.T_map_keyframe[:1]
+    asked_first = module["KeyframeDatabase"](known.data, ExchangeConfig()).agreement(samples, poses)
+    assert len(known.features) == 3
+    assert asked_first == known.agreement(samples, poses) > 0
 
 
 def test_matching_bytes_is_exact() -> None:
