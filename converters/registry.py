@@ -152,7 +152,8 @@ def describe() -> str:
     lines = []
     for name in sorted(DATASETS):
         module = _module(name)
-        lines.append(f"{name}: {(module.__doc__ or '').splitlines()[0]}")
+        summary, _, _ = (module.__doc__ or "").partition("\n")  # `python -OO` leaves none
+        lines.append(f"{name}: {summary}")
         documented = module.Options.documentation()
         for option, field in module.Options.model_fields.items():
             lines.append(

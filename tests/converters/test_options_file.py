@@ -10,6 +10,7 @@ import tomlkit
 from typer.testing import CliRunner
 
 from duagc.converters import registry
+from duagc.converters.datasets import seven_scenes
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
 from tests.fixtures.box_room import path, render, save
@@ -114,3 +115,9 @@ def test_the_list_of_datasets_says_what_every_option_is() -> None:
     options = [line.strip() for line in registry.describe().splitlines() if line.startswith(" ")]
     assert len(options) > 50
     assert not [line for line in options if not line.partition("  ")[2]]
+
+
+def test_datasets_are_listed_without_docstrings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `python -OO` leaves them."""
+    monkeypatch.setattr(seven_scenes, "__doc__", None)
+    assert "7scenes: \n    --set frame_limit=0" in registry.describe()
