@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
-from duagc.converters.layouts.ros_images import is_depth, is_unusable
+from duagc.converters.layouts.ros_images import DEPTH_ENCODINGS, is_depth, is_unusable
 from duagc.converters.logs.cameras import image_path
 from duagc.converters.logs.entries import LogTopic, ros_type
 from duagc.converters.logs.files import Log, is_below
@@ -132,9 +132,14 @@ class Chooser:
             )
         if choice.topic or not lost:
             return choice
-        return replace(
-            choice, why=f"{choice.why}; {', '.join(lost)} holds no depth, or as JPEG, which destroys it"
-        )
+        return replace(choice, why=f"{choice.why}; {', '.join(map(self._no_depth_words, lost))}")
+
+    def _no_depth_words(self, topic: str) -> str:
+        """Why images that are named so hold no depth."""
+        encoding = getattr(self.images[topic], "encoding", None)
+        if encoding is None:
+            return f"{topic} holds no depth, or as JPEG, which destroys it"
+        return f"{topic} has encoding {encoding!r}, none of {', '.join(DEPTH_ENCODINGS)}"
 
     def _near_color(self, topics: Sequence[str]) -> Sequence[str]:
         """Topics whose names share most with that of color: of several cameras each has its own depth."""

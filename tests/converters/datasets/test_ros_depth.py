@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -103,6 +104,18 @@ def test_infrared_images_are_not_taken_for_depth(tmp_path: Path) -> None:
         DuagError, match="image_rect_raw/compressed holds no depth, or as JPEG, which destroys it"
     ):
         registry.convert("ros", r.write(tmp_path / "lost", lost, "mcap"), tmp_path / "rec2")
+
+
+def test_depth_in_another_encoding_is_named_with_it(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = [
+        (t, ns, replace(m, encoding="16SC1") if t.endswith("depth_registered/image_raw") else m)
+        for t, ns, m in still(r)
+    ]
+    with pytest.raises(
+        DuagError, match=r"/image_raw has encoding '16SC1', none of 16UC1, mono16, 32FC1; expected --set"
+    ):
+        registry.convert("ros", r.write(tmp_path / "bag", rows, "mcap"), tmp_path / "rec")
 
 
 def test_depth_of_sixteen_bits_is_told_by_its_name_from_infrared(tmp_path: Path) -> None:
