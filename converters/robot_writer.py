@@ -50,7 +50,7 @@ class RobotWriter:
         sensors: Mapping[str, str] | None = None,
         find_regions: bool = True,
     ) -> None:
-        """Initialize.
+        """Check the name, camera and unit of depth; the log is opened when the context is entered.
 
         Args:
             folder: `RecordingWriter.folder`.

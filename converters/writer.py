@@ -84,7 +84,7 @@ class RecordingWriter:
         parameters: Mapping[str, Any] | None = None,
         force: bool = False,
     ) -> None:
-        """Initialize.
+        """Begin without a robot; the folder is made when the context is entered.
 
         Args:
             out: the folder; must not exist, unless `force` and it is a recording.

@@ -83,7 +83,7 @@ class Chain:
     def __init__(
         self, recording: Recording, carrier: Carrier, digests: FileDigests, watch: Watch = UNWATCHED
     ) -> None:
-        """Set up.
+        """Keep what every stage needs; none is looked up or computed yet.
 
         Args:
             recording: that the run is of.

@@ -63,7 +63,7 @@ class Job:
         looking: bool = False,
         versions: Mapping[str, CodeVersion] | None = None,
     ) -> None:
-        """Set up.
+        """Prepare what carries out the stages and, if results are stored, read the versions of the code.
 
         Args:
             recording: that the run is of.

@@ -47,7 +47,7 @@ class TimeLeft:
         wanted: Sequence[stages.Stage],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Begin.
+        """Predict how long front ends and later stages take, before the first step.
 
         Args:
             robots: `frames` and `pixels` of those whose front ends are computed, and `keyframes` if they are known.

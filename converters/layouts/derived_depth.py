@@ -85,7 +85,7 @@ class StereoFrames:
     """Rectified color, depth and sigma of the pairs of one rig."""
 
     def __init__(self, rig: StereoRig, size: tuple[int, int]) -> None:
-        """Initialize.
+        """Keep the calibration, and the size that images must have.
 
         Args:
             rig: the calibrated pair.
@@ -187,7 +187,7 @@ class ScaleCheck:
     """Compares the depth of a stereo pair with that of a LiDAR: they need not know of each other's mistakes."""
 
     def __init__(self, lidar: LidarSource, rig: StereoRig) -> None:
-        """Initialize.
+        """Begin with no sweep compared.
 
         Args:
             lidar: sensor and where it is in the rectified left camera.
@@ -247,7 +247,7 @@ class ImuFeed:
     """Writes IMU readings into a log up to the time of what comes next."""
 
     def __init__(self, robot: RobotWriter, readings: Sequence[tuple[int, Array, Array]]) -> None:
-        """Initialize.
+        """Begin before the first reading.
 
         Args:
             robot: into whose log they are written.

@@ -21,7 +21,7 @@ class FoundRegions:
     """Looks at some frames of a robot."""
 
     def __init__(self, maps: Maps | None = None) -> None:
-        """Set up.
+        """Begin with no image; the first frame that is not held out will be looked at.
 
         Args:
             maps: where in color images the pixels of the recording's camera lie; None: they are that camera's.

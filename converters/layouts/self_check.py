@@ -25,7 +25,7 @@ class ReprojectionCheck:
     """Moves the depth of a frame into a later one by the poses and compares."""
 
     def __init__(self, camera: PinholeCamera, frames: int, gap: int = GAP) -> None:
-        """Initialize.
+        """Choose evenly spread pairs of frames; none is compared yet.
 
         Args:
             camera: of the depth images.

@@ -71,7 +71,7 @@ class Chooser:
     """Chooses among the topics of one robot; reads the first sound message of every topic of images."""
 
     def __init__(self, log: Log, namespace: str = "", wanted: Mapping[str, str] | None = None) -> None:
-        """Initialize.
+        """Read a sound message of every topic of images, and list those of CameraInfo and of points.
 
         Args:
             log: the log.

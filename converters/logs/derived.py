@@ -88,7 +88,7 @@ class Stereo:
     words = "stereo"
 
     def __init__(self, rig: StereoRig, size: tuple[int, int], where: str) -> None:
-        """Initialize.
+        """Take the camera of the rectified images, and its rotation from that of the left ones.
 
         Args:
             rig: rectification and maps of the pair.
@@ -140,7 +140,7 @@ class Sweeps:
     def __init__(
         self, lidar: LidarSource, color: RosCamera, where: tuple[str, str], warnings: Sequence[str] = ()
     ) -> None:
-        """Set up.
+        """Compute the pose of the LiDAR in the camera of the images.
 
         Args:
             lidar: seen from the frame of color, as its motion is.

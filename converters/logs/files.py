@@ -32,7 +32,7 @@ class Log:
     """One or several containers read as one; a context manager."""
 
     def __init__(self, parts: Sequence[LogPart], name: str) -> None:
-        """Initialize.
+        """Merge the topics of all parts, and add up how many messages each has.
 
         Args:
             parts: the containers; a topic may be in several.

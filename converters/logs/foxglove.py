@@ -94,7 +94,7 @@ class JsonFields:
     """A JSON object whose members are attributes; members that are objects too."""
 
     def __init__(self, members: dict[str, Any]) -> None:
-        """Initialize.
+        """Keep the members; objects in them are wrapped when they are read.
 
         Args:
             members: of the JSON object, by name.

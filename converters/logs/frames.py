@@ -28,7 +28,7 @@ class Transforms:
     """
 
     def __init__(self, log: Log, namespace: str = "", warnings: list[str] | None = None) -> None:
-        """Initialize.
+        """Read the constant transforms of `tf_static`; other topics are read when they are needed.
 
         Args:
             log: the log.

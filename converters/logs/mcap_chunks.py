@@ -39,7 +39,7 @@ class Chunks:
     """The chunks of one file that its index lists."""
 
     def __init__(self, stream: IO[bytes], indexes: Sequence[ChunkIndex]) -> None:
-        """Initialize.
+        """Sort the chunks by time; none is read yet.
 
         Args:
             stream: the file, open for reading bytes; it stays open.

@@ -153,7 +153,7 @@ class MotionReader:
         *,
         time_ns: Callable[[Entry], int],
     ) -> None:
-        """Initialize.
+        """Check the topics that are asked for, and read the file of true poses if there is one.
 
         Args:
             log: the log.

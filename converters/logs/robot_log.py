@@ -51,7 +51,7 @@ class RobotLog:
     """
 
     def __init__(self, log: Log, namespace: str, settings: LogOptions) -> None:
-        """Initialize.
+        """Choose the robot's topics, and read its cameras and extrinsics.
 
         Args:
             log: open; it must stay so.

@@ -124,7 +124,7 @@ class FrameRenderer:
     """Renders, disturbs and encodes frames; what it makes of a job depends on nothing but the job."""
 
     def __init__(self, scene: SimulatedScene, settings: FrameSettings) -> None:
-        """Initialize.
+        """Prepare the renderers, a stereo pair, and the vignette and lens that the settings ask for.
 
         Args:
             scene: what is seen.
@@ -276,7 +276,7 @@ class RenderPool:
     """
 
     def __init__(self, workers: int) -> None:
-        """Initialize.
+        """Keep the number of workers; if there are several, they start when the context is entered.
 
         Args:
             workers: how many processes.

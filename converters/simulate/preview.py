@@ -35,7 +35,7 @@ class Preview:
         *,
         kept: list[list[int]],
     ) -> None:
-        """Initialize.
+        """Choose the frames of each robot that are shown, evenly spread over the recorded ones.
 
         Args:
             title: one line over the sheet.

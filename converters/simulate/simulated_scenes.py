@@ -104,7 +104,7 @@ class SimulatedRoom:
     step_m, depth_scale_m, sky = ROOM.step_m, ROOM.depth_scale_m, ROOM.sky
 
     def __init__(self, seed: int, atlas: bake.Atlas | None = None) -> None:
-        """Initialize; a thread paints the scene meanwhile.
+        """Build the room; unless its colors are known, a thread bakes them meanwhile.
 
         Args:
             seed: of the scene.
@@ -201,7 +201,7 @@ class SimulatedMeshes:
     """A scene of meshes, ready to be rendered."""
 
     def __init__(self, seed: int, folder: Path, settings: SceneSettings = MESHES) -> None:
-        """Initialize.
+        """Load the meshes for rendering; the free space is computed when it is first needed.
 
         Args:
             seed: of paths and points.

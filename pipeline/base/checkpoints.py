@@ -60,7 +60,7 @@ class Checkpoints:
         largest_share: float = LARGEST_SHARE,
         report: StepReport | None = None,
     ) -> None:
-        """Set up.
+        """Begin with nothing saved or read; the time until the first checkpoint runs from now.
 
         Args:
             folder: of this computation alone; made when something is saved. None: nothing is saved.

@@ -28,7 +28,7 @@ class ThreadShare:
     """How many processes are at work on some tasks, as these processes see it."""
 
     def __init__(self, workers: int, tasks: int, in_all: int | None = None) -> None:
-        """Begin.
+        """Count every worker as busy for which there is a task.
 
         Args:
             workers: processes, each with one task at a time.

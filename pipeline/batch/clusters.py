@@ -38,7 +38,7 @@ class SlurmEngine:
     """Jobs of Slurm, or, to try that out, of this machine by submitit's local executor."""
 
     def __init__(self, slots: int, folder: Path, *, cluster: str | None = None, **parameters: Any) -> None:
-        """Set up.
+        """Configure submitit for jobs of one task on one processor; none is submitted yet.
 
         Args:
             slots: jobs at the same time.

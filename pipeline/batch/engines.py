@@ -40,7 +40,7 @@ class LocalEngine:
     """Processes of this machine, each with a share of its processors; use it as a context manager."""
 
     def __init__(self, slots: int) -> None:
-        """Set up.
+        """Divide the processors that this process may use among the slots; no cell runs yet.
 
         Args:
             slots: cells at the same time.

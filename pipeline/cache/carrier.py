@@ -25,7 +25,7 @@ class NotStoredError(Exception):
     """A stage would have to be computed."""
 
     def __init__(self, key: StageKey) -> None:
-        """Initialize.
+        """Name the stage, and its robot if it has one, in the message.
 
         Args:
             key: of the stage that the store does not have.

@@ -54,7 +54,7 @@ class CodeReader:
     """Reads versions of code. What it parsed once it finds again, by the digest of the file."""
 
     def __init__(self, known: Path | None = None, root: Path | None = None) -> None:
-        """Set up.
+        """Load what earlier processes parsed; no version is read yet.
 
         Args:
             known: file in which parsed modules are kept between processes; None: nothing is kept.

@@ -35,7 +35,7 @@ class FileDigests:
     """Digests by path. A file whose size, times and inode are those of the last time is not read again."""
 
     def __init__(self, folder: Path | None) -> None:
-        """Set up.
+        """Take the folder in which digests are kept; no file is read yet.
 
         Args:
             folder: where digests are kept between processes; None: nothing is kept.

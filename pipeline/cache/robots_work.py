@@ -115,7 +115,7 @@ class RobotsWork:
     """The same work of some robots, several side by side."""
 
     def __init__(self, of: Mapping[str, RobotWork], workers: int, slower: float, now: float) -> None:
-        """Begin.
+        """Take the work of every robot, which begins at `now` unless `start` is called.
 
         Args:
             of: by robot, in the order in which they begin.

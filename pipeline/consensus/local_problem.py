@@ -22,7 +22,7 @@ class LocalProblem:
     """
 
     def __init__(self, factors: RelativePoses, config: PoseConsensusConfig) -> None:
-        """Set up; the weights follow.
+        """Give every factor the weight 1, until `weigh` is called; nothing is factorized yet.
 
         Args:
             factors: between the robot's variables.

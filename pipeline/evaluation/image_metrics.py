@@ -174,7 +174,7 @@ class SsimReference:
     """An image that renders are compared with by SSIM and MS-SSIM; what depends on it alone is computed once."""
 
     def __init__(self, reference: NDArray, mask: masks.Mask | None = None) -> None:
-        """Set up.
+        """Keep the image; each of its scales is computed when it is first needed.
 
         Args:
             reference: colors [H, W, 3] in 0..1.

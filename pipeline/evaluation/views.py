@@ -60,7 +60,7 @@ class ComparedImage:
     """An image that renders are compared with; what depends on it alone is computed once."""
 
     def __init__(self, color: NDArray[np.uint8], mask: Mask | None = None) -> None:
-        """Set up.
+        """Convert the colors to 0..1 and to planes, as comparisons need them.
 
         Args:
             color: [h, w, 3] RGB.

@@ -53,7 +53,7 @@ class TeamBench:
     """A run's team, ready to meet again and again."""
 
     def __init__(self, run: RunFolder, recording: Recording, config: ExchangeConfig, seed: int) -> None:
-        """Initialize.
+        """Load the robots of the run, each with few of its Gaussians, and their ground truth.
 
         Args:
             run: a finished run.

@@ -68,7 +68,7 @@ class JointTraining:
         seed: int,
         threads: SupportsIndex = 1,
     ) -> None:
-        """Set up.
+        """Begin at the given poses of the views, before the first step.
 
         Args:
             views: of all tiles.

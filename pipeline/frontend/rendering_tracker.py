@@ -97,7 +97,7 @@ class PoseFit:
         *,
         threads: SupportsIndex = 1,
     ) -> None:
-        """Set up.
+        """Prepare the rasterizer, the step lengths, and the loss without its term of opacity.
 
         Args:
             camera: of the images.

@@ -88,7 +88,7 @@ class ShutterSearch:
         depth: DepthKind,
         threads: SupportsIndex = 1,
     ) -> None:
-        """Set up.
+        """Prepare the training step, at half the resolution where images are large.
 
         Args:
             log: of the robot.

@@ -14,7 +14,7 @@ class TileCheckpoints(Checkpoints):
     def __init__(
         self, of_map: Checkpoints, others: Any, *, found: tuple[int, Any] | None, before: int, total: int
     ) -> None:
-        """Set up.
+        """Take no folder: states are saved by the checkpoints of the map.
 
         Args:
             of_map: checkpoints that are saved to.

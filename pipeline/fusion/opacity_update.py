@@ -80,7 +80,7 @@ class _OwnPixels:
     def __init__(
         self, views: Sequence[PosedRgbd], context: MapContext, precision: np.float32, limit: np.float32
     ) -> None:
-        """Set up.
+        """Prepare the rasterizer and the two halves of the pixels; nothing is drawn yet.
 
         Args:
             views: the images.

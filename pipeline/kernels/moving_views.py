@@ -60,7 +60,7 @@ class MovingViews:
     """Draws maps from the places that a camera passes, with a rasterizer for each, which its derivatives need."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
-        """Set up.
+        """Begin with one rasterizer; those of other places are added when they are needed.
 
         Args:
             rasterizer: of the first place; the others are as this one.

@@ -60,7 +60,7 @@ class SparseSteps:
     """What each step of a training looks at."""
 
     def __init__(self, config: SparseStepsConfig, camera: PinholeCamera, steps: int) -> None:
-        """Set up.
+        """Compute until which step `closing` holds, and from which one views are drawn with their motion.
 
         Args:
             config: what is left out, and until when.

@@ -20,7 +20,7 @@ class ColorImages:
     """
 
     def __init__(self, camera: PinholeCamera, lens: Lens | None) -> None:
-        """Set up.
+        """Compute where the pixels of the camera lie in images of the lens, if there is one.
 
         Args:
             camera: whose pixels the images get.

@@ -45,7 +45,7 @@ class OdometryPrior:
     """Poses of the camera by another odometry, in a frame of its own, interpolated between its messages."""
 
     def __init__(self, stamps_ns: Sequence[int], T_odometry_camera: Array) -> None:
-        """Set up.
+        """Keep the poses between which motions are interpolated.
 
         Args:
             stamps_ns: increasing.
@@ -84,7 +84,7 @@ class GyroPrior:
     """Rotation by the integrated rates of a gyroscope; a rate holds from the middle before it to the middle after."""
 
     def __init__(self, stamps_ns: Sequence[int], rates_camera: Array) -> None:
-        """Set up.
+        """Keep the rates that are integrated to rotations.
 
         Args:
             stamps_ns: increasing.

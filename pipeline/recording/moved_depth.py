@@ -33,7 +33,7 @@ class DepthMotion:
     """
 
     def __init__(self, *parts: Trajectory) -> None:
-        """Set up.
+        """Keep the poses; the curve around a frame is fitted when it is first needed.
 
         Args:
             parts: T_map_camera of the tracked frames; of every part that has a frame of its own.

@@ -177,7 +177,7 @@ class SeenPoints:
     """
 
     def __init__(self, camera: PinholeCamera, depth_m: Image) -> None:
-        """Set up.
+        """Back-project a coarse grid of pixels by the mean inverse depth around each.
 
         Args:
             camera: of the image.
@@ -193,7 +193,7 @@ class Unrolling:
     """Where in a rolling image each pixel of a still one is."""
 
     def __init__(self, seen: SeenPoints, T_middle_line: Array, *, by_columns: bool = False) -> None:
-        """Set up.
+        """Invert the motions of the lines; where pixels lie is computed when it is first needed.
 
         Args:
             seen: in the image.

@@ -48,7 +48,7 @@ class LogWriter:
     """
 
     def __init__(self, path: Path, robot: str = "", metadata: Mapping[str, str] | None = None) -> None:
-        """Set up.
+        """Keep the path and the metadata; the file is opened when the context is entered.
 
         Args:
             path: the file.

@@ -12,7 +12,7 @@ class DeclaredSettings:
     """Settings of a run as one stage may read them: anything else is an error, not a default."""
 
     def __init__(self, config: Config, stage: str, declared: Sequence[str], path: str = "") -> None:
-        """Set up.
+        """Keep the settings, and the names of those that may be read.
 
         Args:
             config: settings, or a section of them.

@@ -28,7 +28,7 @@ class KeyframeImages:
     """Gives images by the number of the keyframe."""
 
     def __init__(self, log: Path, frontend: Path, frames: Sequence[int]) -> None:
-        """Set up.
+        """Keep the paths; the logs are read when the first image is asked for.
 
         Args:
             log: of the robot's sensors.

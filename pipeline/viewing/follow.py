@@ -37,7 +37,7 @@ class Follower:
     """Shows what one process of a run does."""
 
     def __init__(self, stream: rr.RecordingStream, began_ns: int) -> None:
-        """Set up.
+        """Keep the stream, and the time that its timeline counts from.
 
         Args:
             stream: that goes to the server.

@@ -26,7 +26,7 @@ class Caster:
     """Rays through a scene and distances to it, on one thread: the same numbers whatever the machine does besides."""
 
     def __init__(self, scene: MeshScene) -> None:
-        """Initialize.
+        """Give the triangles to Embree, on one thread.
 
         Args:
             scene: the triangles that rays meet.
@@ -86,7 +86,7 @@ class MeshRenderer:
     """Renders a scene of meshes with one camera."""
 
     def __init__(self, caster: Caster, camera: PinholeCamera, sky: bool = False) -> None:
-        """Initialize.
+        """Compute how many texels per meter each triangle has, by which mip levels are chosen.
 
         Args:
             caster: rays through the scene.

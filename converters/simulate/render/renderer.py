@@ -73,7 +73,7 @@ class Renderer:
     def __init__(
         self, scene: Scene, atlas: Atlas | None, camera: PinholeCamera, *, isa: str = "auto"
     ) -> None:
-        """Initialize.
+        """Collect the surfaces in arrays, and list the columns and rows of the image.
 
         Args:
             scene: what is seen.

@@ -25,7 +25,7 @@ class SurfaceArrays:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Initialize.
+        """Collect the geometry of all surfaces, and put a box around each curved one.
 
         Args:
             scene: with the surfaces.
@@ -55,7 +55,7 @@ class SurfacesFromPose:
     """
 
     def __init__(self, scene: SurfaceArrays, camera: PinholeCamera, T_world_camera: ArrayLike) -> None:
-        """Initialize.
+        """Find the flat surfaces that face the camera, and compute the coefficients of all flat ones.
 
         Args:
             scene: the surfaces.

@@ -122,7 +122,7 @@ class MovingCamera:
         lens: RadialLens | None = None,
         blur_px: float = 0.0,
     ) -> None:
-        """Initialize.
+        """Compute the rays of the pixels, and into how many moments an exposure is divided.
 
         Args:
             renderer: of the scene, with the camera whose images are rendered.

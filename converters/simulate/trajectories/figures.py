@@ -175,7 +175,7 @@ class Ground:
     """The free floor of a terrain, and paths on it."""
 
     def __init__(self, terrain: Terrain, frames: int, seed: int) -> None:
-        """Initialize.
+        """Compute how far inside the free floor every cell is, and the slope of this distance.
 
         Args:
             terrain: whose floor it is.
