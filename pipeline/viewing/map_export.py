@@ -182,7 +182,8 @@ def _write_points(path: Path, part: Gaussians, columns: dict[str, NDArray[np.flo
     written = o3d.t.io.write_point_cloud(str(path), cloud)
     back = o3d.t.io.read_point_cloud(str(path)).point if written else {}
     if not written or any(
-        not np.array_equal(back[name].numpy(), cloud.point[name].numpy(), equal_nan=name == "sigma_m")
+        name not in back
+        or not np.array_equal(back[name].numpy(), cloud.point[name].numpy(), equal_nan=name == "sigma_m")
         for name in ("positions", "colors", *columns)
     ):
         raise DuagError(f"{path}: could not be written; is the disk full?")

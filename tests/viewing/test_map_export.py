@@ -17,6 +17,7 @@ from duagc.pipeline.splat.ply import read_ply
 from duagc.pipeline.viewing import map_export
 from duagc.pipeline.viewing.map_export import ExportPlan, export, tiles
 from tests.fixtures.fake_run import FakeRun, make
+from tests.fixtures.full_disks import no_file_larger_than
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +99,13 @@ def test_a_gaussian_of_which_nothing_is_stated_has_no_deviation(fake, tmp_path, 
     sigma_m = cloud["sigma_m"].numpy()[:, 0]
     assert np.flatnonzero(np.isnan(sigma_m)).tolist() == [3]
     np.testing.assert_array_equal(cloud.positions.numpy(), final_means(RunFolder(fake.run).robots["alpha"]))
+
+
+def test_points_that_find_no_room_are_told(fake, tmp_path):
+    plan = ExportPlan("points", min_opacity=0.0)
+    with no_file_larger_than(200), pytest.raises(DuagError, match="ply: could not be written"):
+        export(fake.run, tmp_path / "out", plan)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_faint_gaussians_are_no_points(fake, tmp_path):
