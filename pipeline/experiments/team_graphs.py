@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
 from duagc.pipeline.base.random_streams import generator
 from duagc.pipeline.geometry import se3, so3
 
@@ -226,7 +227,8 @@ def write(graph: TownGraph, folder: Path, *, force: bool = False) -> None:
         for robot in range(len(graph.T_world_keyframe)):
             (out / f"robot{robot}").mkdir()
             rows = [(m, ODOMETRY) for m in graph.odometry] + [(m, CLOSURE) for m in graph.closures]
-            with (out / f"robot{robot}" / "measurements.csv").open("w", newline="") as file:
+            path = out / f"robot{robot}" / "measurements.csv"
+            with new_file(path) as part, part.open("w", newline="") as file:
                 table = csv.writer(file, lineterminator="\n")
                 table.writerow(COLUMNS.split(","))
                 for (a, i, b, j, T), noise in rows:
@@ -236,4 +238,5 @@ def write(graph: TownGraph, folder: Path, *, force: bool = False) -> None:
         lines = ["robot_src,pose_src,robot_dst,pose_dst,inlier\n"]
         for (a, i, b, j, _), true in zip(graph.closures, graph.true, strict=True):
             lines.append(f"{a},{i},{b},{j},{int(true)}\n")
-        (out / "reference_inliers.csv").write_text("".join(lines))
+        with new_file(out / "reference_inliers.csv") as part:
+            part.write_text("".join(lines))

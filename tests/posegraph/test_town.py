@@ -11,6 +11,7 @@ from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.posegraph.gnc import RobustWeights
 from duagc.pipeline.team_posegraph import solve
 from tests.fixtures.commands import assert_one_line, duagc_here
+from tests.fixtures.full_disks import no_file_larger_than
 
 
 def off_m(graph):
@@ -104,3 +105,13 @@ def test_weights_are_truncated_anew_until_nothing_changes():
     np.testing.assert_array_equal(weights.weights, [1, 1])
     assert not weights.advance(received + 2 * config.check_packets, True, lambda: squared)
     assert weights.done
+
+
+def test_a_table_that_finds_no_room_is_named(tmp_path):
+    graph = generate(2, 10, 0, 0.0, seed=0)
+    with (
+        no_file_larger_than(100),
+        pytest.raises(DuagError, match=r"robot0/measurements\.csv: File too large"),
+    ):
+        write(graph, tmp_path / "town")
+    assert list(tmp_path.iterdir()) == []
