@@ -80,7 +80,8 @@ def _measured(
         [sys.executable, "-m", __name__, said], stdout=subprocess.PIPE, text=True, check=False
     )
     if done.returncode:
-        raise DuagError(f"{src}: the process that was to {task} it ended with {done.returncode}")
+        why = done.stdout.strip().rpartition("\n")[2] or f"ended with {done.returncode}"
+        raise DuagError(f"{src}: the process that was to {task} it: {why}")
     return {**json.loads(done.stdout.splitlines()[-1]), "wall_s": time.monotonic() - start}
 
 
@@ -157,4 +158,8 @@ if __name__ == "__main__":
     from duagc.pipeline.base import determinism
 
     determinism.configure_determinism()
-    _main(sys.argv[1])
+    try:
+        _main(sys.argv[1])
+    except (DuagError, OSError) as failed:
+        print(failed)
+        sys.exit(1)

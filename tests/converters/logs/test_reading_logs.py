@@ -20,6 +20,7 @@ from duagc.converters.logs.entries import Entry
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.bench import convert
 from duagc.pipeline.geometry.camera import PinholeCamera
+from tests.fixtures.full_disks import no_file_larger_than
 from tests.fixtures.long_logs import COLOR, DEPTH, FRAME, IMU, KINDS, Seed, write
 
 CAMERA = PinholeCamera(96, 64, 80.0, 80.0, 47.5, 31.5)
@@ -165,3 +166,12 @@ def test_the_bench_compares_the_same_messages(logs: dict[str, Path], tmp_path: P
     assert "processor time" in convert.format_table(found)
     with pytest.raises(DuagError, match="imu topic /none not found"):
         convert.run(logs["bag"], ["imu=/none"], tmp_path / "bench")
+
+
+def test_a_bench_that_finds_no_room_is_one_line(
+    logs: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with no_file_larger_than(2000), pytest.raises(DuagError, match=r"to copy it: .*File too large"):
+        convert.run(logs["bag"], [], tmp_path / "bench")
+    assert not (tmp_path / "bench").exists()
+    assert capfd.readouterr().err == ""
