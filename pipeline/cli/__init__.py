@@ -6,6 +6,7 @@ from io import TextIOWrapper
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.said_lines import open_closed_streams
 from duagc.pipeline.base.stop_signals import ending_as_interrupts
 from duagc.pipeline.cli.common import EXIT_FAILED, app
 
@@ -51,6 +52,7 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's shar
 def main() -> None:
     """Entry point: one line and exit code 1 for whatever a user can fix."""
     determinism.configure_determinism()
+    open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
             stream.reconfigure(errors="replace")  # a terminal may lack a letter of a name

@@ -18,6 +18,7 @@ from duagc.pipeline.base.files import new_file
 from tests.fixtures import fake_run
 from tests.fixtures.commands import ROOT, assert_one_line, duagc, duagc_here, listen_to_interrupts
 from tests.fixtures.recording_logs import write_camera
+from tests.fixtures.ros_bags import Ros, still
 
 
 def test_help_is_there_for_every_command() -> None:
@@ -99,6 +100,15 @@ def test_a_letter_that_the_terminal_lacks_is_replaced(terminal: dict[str, str]) 
         env=os.environ | terminal,
     )
     assert (result.returncode, result.stdout, result.stderr) == (0, "sigma? ?\n", "")
+
+
+def test_standard_streams_may_be_closed(tmp_path: Path) -> None:
+    r, out = Ros(1), tmp_path / "rec"
+    words = ["convert", "ros", str(r.write(tmp_path / "bag", still(r), "plain")), "--out", str(out)]
+    main = [sys.executable, "-c", "from duagc.pipeline.cli import main; main()"]
+    command = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *main, *words]
+    assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0
+    assert (out / "recording.json").is_file()
 
 
 def test_a_full_disk_is_one_line() -> None:
