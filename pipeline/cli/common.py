@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from duagc import __version__
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.said_lines import say_line
 
 EXIT_FAILED, EXIT_DIFFERENT = 1, 3
@@ -18,6 +19,17 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 def of_home(path: str) -> str:
     """A path whose `~` is the home of the user; the shell leaves it in `--out=~/room` and in quotes."""
     return os.path.expanduser(path)
+
+
+def _checked_path(path: Path) -> Path:
+    """A path with the home of the user in the place of `~`, which libraries that take only UTF-8 write, too."""
+    try:
+        named_alike = os.fsencode(path) == str(path).encode()
+    except UnicodeEncodeError:  # bytes that are no letters
+        named_alike = False
+    if not named_alike:
+        raise DuagError(f"{path}: is no name in UTF-8, expected one, and a locale such as C.UTF-8")
+    return Path(of_home(str(path)))
 
 
 class Commands(typer.Typer):
@@ -31,7 +43,7 @@ class Commands(typer.Typer):
             @wraps(command)
             def called(**values: Any) -> Any:
                 return command(
-                    **{n: Path(of_home(str(v))) if isinstance(v, Path) else v for n, v in values.items()}
+                    **{n: _checked_path(v) if isinstance(v, Path) else v for n, v in values.items()}
                 )
 
             register(called)

@@ -1,6 +1,7 @@
 """Paths that begin with `~`: the shell expands no `--out=~/room`, and nothing in quotes."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,11 @@ def test_paths_that_are_part_of_a_text_begin_at_home(home: Path) -> None:
 def test_the_store_of_the_environment_begins_at_home(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DUAGC_STORE", "~/store")
     assert default_store(Path("run")) == home / "store"
+
+
+def test_a_name_that_libraries_cannot_take_is_refused(tmp_path: Path) -> None:
+    refused = duagc_here("run", tmp_path, "--out", tmp_path / os.fsdecode(b"run\xff"))
+    assert_one_line(refused, r"run\udcff: is no name in UTF-8", "a locale such as C.UTF-8")
 
 
 def test_every_group_of_commands_reads_paths_so() -> None:
