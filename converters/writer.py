@@ -29,7 +29,7 @@ from typing import Any
 from duagc import __version__
 from duagc.converters.layouts.validity import ALL_ROBOTS, USER_MASKS
 from duagc.converters.robot_writer import RobotWriter
-from duagc.pipeline.base.atomic_folder import RECORDING, new_folder
+from duagc.pipeline.base.atomic_folder import RECORDING, new_folder, resolved
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -95,7 +95,7 @@ class RecordingWriter:
             force: replace a recording that is there.
         """
         self.out = Path(out)
-        self.name = name or self.out.resolve().name
+        self.name = name or resolved(self.out).name
         self.warnings: list[str] = []
         self.parameters = dict(parameters or {})
         self.checks: dict[str, Any] = {}

@@ -22,7 +22,7 @@ from duagc.converters.simulate.trajectories.moments import pose_at, twists_of
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.atomic_folder import check_apart
+from duagc.pipeline.base.atomic_folder import check_apart, resolved
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -362,7 +362,7 @@ def _check_output(out: Path, workers: int, preview: Path | None) -> None:
     """Refuse a number of workers or a picture that cannot be."""
     if not 1 <= workers <= MAX_WORKERS:
         raise DuagError(f"simulate: workers is {workers}, expected 1 to {MAX_WORKERS}")
-    if preview is not None and out.resolve() in preview.resolve().parents:
+    if preview is not None and resolved(out) in resolved(preview).parents:
         raise DuagError(f"{preview}: is inside the recording that is replaced, expected a picture elsewhere")
     if preview is not None and preview.exists():
         raise DuagError(f"{preview}: exists already, expected the name of a new picture")

@@ -59,16 +59,25 @@ def check_apart(out: Path, inputs: Sequence[Path]) -> None:
     Raises:
         DuagError: names the input, which lies there or is a link that leads back to itself.
     """
-    place = out.resolve()
+    place = resolved(out)
     for path in inputs:
-        try:
-            found = path.resolve()
-        except (OSError, RuntimeError) as error:  # of Python before 3.13
-            raise DuagError(
-                f"{path}: a link that leads back to itself, expected a file or a folder"
-            ) from error
-        if found.is_relative_to(place):
+        if resolved(path).is_relative_to(place):
             raise DuagError(f"{out}: found {path} in it, expected --out apart from what is read or kept")
+
+
+def resolved(path: Path) -> Path:
+    """Where a path leads, without links.
+
+    Args:
+        path: of a file or folder, or of what is to be one.
+
+    Raises:
+        DuagError: it is a link that leads back to itself.
+    """
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError) as error:  # of Python before 3.13
+        raise DuagError(f"{path}: a link that leads back to itself, expected a file or a folder") from error
 
 
 def _settle(replaced: Path, out: Path) -> None:

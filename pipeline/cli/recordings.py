@@ -173,12 +173,12 @@ def calibrate(
 def _place_of_calibrated(place: ExitStack, recording: "Recording", out: Path, force: bool) -> Path:
     """Where to write a calibrated recording, before anything is measured."""
     from duagc.converters.calibrated_copy import why_not
-    from duagc.pipeline.base.atomic_folder import RECORDING, check_apart, new_folder
+    from duagc.pipeline.base.atomic_folder import RECORDING, check_apart, new_folder, resolved
 
     for robot in recording.robots:
         if why := why_not(recording.log(robot)):
             raise DuagError(why)
-    if out.resolve() == recording.path.resolve():
+    if resolved(out) == resolved(recording.path):
         raise DuagError(f"{out}: is the recording itself, expected the name of another")
     check_apart(out, [recording.path])
     return place.enter_context(new_folder(out, force, RECORDING))

@@ -111,6 +111,14 @@ def test_standard_streams_may_be_closed(tmp_path: Path) -> None:
     assert (out / "recording.json").is_file()
 
 
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="such links are taken for links to nothing")
+def test_a_link_that_leads_back_to_itself_is_no_output(tmp_path: Path) -> None:
+    out, source = tmp_path / "out", tmp_path / "source"
+    out.symlink_to(out)
+    for words in (["simulate"], ["convert", "ros", source], ["run", source], ["export", source]):
+        assert_one_line(duagc_here(*words, "--out", out), "out: a link that leads back to itself")
+
+
 def test_a_full_disk_is_one_line() -> None:
     command = "lambda: open('/dev/full', 'wb', buffering=0).write(b'a log')"
     code = f"from duagc.pipeline import cli; cli.app = {command}; cli.main()"
