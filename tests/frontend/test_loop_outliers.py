@@ -53,3 +53,30 @@ def test_a_wrong_loop_closure_is_left_out() -> None:
     assert found == loops
     assert consistent_loops(start, pairs, [alike], LoopConfig()) == []
     assert consistent_loops(start, pairs, [alike], LoopConfig(robust=False)) == [alike]
+
+
+def test_floors_built_alike_do_not_bend_the_path() -> None:
+    """Loop closures between two floors of a staircase outnumber the path between them, and agree with each other."""
+    up = np.eye(4)
+    up[1, 3] = -0.04  # a keyframe, 0.8 m a round
+    truth = np.array([np.linalg.matrix_power(up, k) @ T for k, T in enumerate(true_path())])
+    start, pairs = drifting(truth)
+    floor = [se3.inverse(truth[i]) @ truth[i + 1] for i in range(COUNT - 1)]
+    alike = [
+        RelativePose(i, 20 + i + more, floor[i] if more else np.eye(4), INFORMATION)
+        for more in (0, 1)
+        for i in range(20 - more)
+    ]
+    truly = [closure(truth, i, i + 10) for i in (2, 12, 22)]
+    assert consistent_loops(start, pairs, alike, LoopConfig()) == []
+    assert consistent_loops(start, pairs, [*alike, *truly], LoopConfig()) == truly
+
+
+def test_loop_closures_correct_a_place_where_tracking_was_wrong() -> None:
+    truth = true_path()
+    start, pairs = drifting(truth)
+    slip = se3.exp(np.array([0.3, 0.0, 0.2, 0.0, 0.1, 0.0]))
+    pairs[14] = RelativePose(14, 15, pairs[14].T_i_j @ slip, INFORMATION)
+    start[15:] = start[14] @ pairs[14].T_i_j @ se3.inverse(start[15]) @ start[15:]
+    loops = [closure(truth, i, i + 20) for i in range(15)]  # all across that place
+    assert consistent_loops(start, pairs, loops, LoopConfig()) == loops
