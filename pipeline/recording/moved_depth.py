@@ -11,6 +11,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.depth_sources import DepthImage
 from duagc.pipeline.recording.read import log_metadata, read_log
@@ -23,13 +24,18 @@ LEAST_MOVE_PX = 0.25  # of a point at the median depth: less is not worth to int
 FARTHEST_EDGE_PX = 24  # of a nearer surface that may come to lie over a pixel
 REACH_NS = 250_000_000  # from a frame to those by which its motion is known
 FRAMES_AROUND = 3  # of these, before and after it
+DEGREE, DEGREE_OF_SHAKES = 2, 4  # of the curve through their poses
+COMPARED_FRAMES = 100  # of a part, by which the degree is chosen
+SHAKES_FROM = 2.0  # times the errors of the higher degree, of a parabola: most of these are motion then
 
 
 class DepthMotion:
     """How the camera moved between the times of color and depth, by the poses of its frames.
 
     A pose that was found with color and depth of different times lies between the two. So the motion is that of a
-    smooth curve through the poses of the frames around, not that from one to the next.
+    smooth curve through the poses of the frames around, not that from one to the next. A parabola would be smoother
+    than a camera that shakes: where a curve of higher degree predicts poses from those around them clearly better, what
+    a parabola leaves is motion, not the errors of poses.
     """
 
     def __init__(self, *parts: Trajectory) -> None:
@@ -39,6 +45,7 @@ class DepthMotion:
             parts: T_map_camera of the tracked frames; of every part that has a frame of its own.
         """
         self._parts = parts
+        self._degrees: dict[int, int] = {}  # by the number of a part
         self._curves: dict[int, Array | None] = {}  # by the time of a frame
 
     def between(self, color_ns: int, depth_ns: int) -> Array | None:
@@ -74,26 +81,53 @@ class DepthMotion:
 
     def _curve(self, color_ns: int) -> Array | None:
         """The curve around a frame."""
-        for part in self._parts:
+        for number, part in enumerate(self._parts):
             at = int(np.searchsorted(part.stamps_ns, color_ns))
             if at < len(part.stamps_ns) and part.stamps_ns[at] == color_ns:
-                return _curve_in(part, at)
+                if number not in self._degrees:
+                    self._degrees[number] = _degree_of(part)
+                return _curve_in(part, at, self._degrees[number])
         return None
 
 
-def _curve_in(part: Trajectory, at: int) -> Array | None:
-    """Tangents from a frame as a polynomial of seconds, [degree + 1, 6]; None without other frames near it."""
-    offsets_ns = part.stamps_ns - part.stamps_ns[at]
-    near = np.flatnonzero(np.abs(offsets_ns) <= REACH_NS)
+def _around(part: Trajectory, at: int) -> NDArray[np.intp]:
+    """Indices of the frames by whose poses the motion of a frame is known, itself among them."""
+    near = np.flatnonzero(np.abs(part.stamps_ns - part.stamps_ns[at]) <= REACH_NS)
     first = max(int(np.searchsorted(near, at)) - FRAMES_AROUND, 0)
     first = max(min(first, len(near) - 2 * FRAMES_AROUND - 1), 0)
-    chosen = near[first : first + 2 * FRAMES_AROUND + 1]
+    return near[first : first + 2 * FRAMES_AROUND + 1]
+
+
+def _fitted(part: Trajectory, at: int, chosen: NDArray[np.intp], degree: int) -> Array:
+    """Tangents from a frame, through the poses of others, as a polynomial of seconds, [degree + 1, 6]."""
+    seconds = 1e-9 * (part.stamps_ns[chosen] - part.stamps_ns[at])
+    motions = se3.log(se3.inverse(part.poses[at]) @ part.poses[chosen])
+    return np.asarray(np.linalg.lstsq(np.vander(seconds, degree + 1), motions, rcond=None)[0])
+
+
+def _curve_in(part: Trajectory, at: int, degree: int = DEGREE) -> Array | None:
+    """Tangents from a frame as a polynomial of seconds, [degree + 1, 6]; None without other frames near it."""
+    chosen = _around(part, at)
     if len(chosen) < 2:
         return None
-    seconds = 1e-9 * offsets_ns[chosen]
-    motions = se3.log(se3.inverse(part.poses[at]) @ part.poses[chosen])
-    degree = 2 if len(chosen) > 3 else 1
-    return np.asarray(np.linalg.lstsq(np.vander(seconds, degree + 1), motions, rcond=None)[0])
+    if len(chosen) <= 2 * FRAMES_AROUND:
+        degree = DEGREE if len(chosen) > 3 else 1
+    return _fitted(part, at, chosen, degree)
+
+
+def _degree_of(part: Trajectory) -> int:
+    """Degree of the curves, by how far poses are from curves through those around them (m, and rad as if at 1 m)."""
+    some = evenly_spaced(len(part), min(COMPARED_FRAMES, len(part)))
+    off: dict[int, list[float]] = {DEGREE: [], DEGREE_OF_SHAKES: []}
+    for at in (int(k) for k in some):
+        chosen = _around(part, at)
+        if len(chosen) == 2 * FRAMES_AROUND + 1 and chosen[FRAMES_AROUND] == at:
+            for degree, of_degree in off.items():
+                of_degree.append(float(np.linalg.norm(_fitted(part, at, chosen[chosen != at], degree)[-1])))
+    if not off[DEGREE]:
+        return DEGREE
+    shakes = np.median(off[DEGREE]) > SHAKES_FROM * np.median(off[DEGREE_OF_SHAKES])
+    return DEGREE_OF_SHAKES if shakes else DEGREE
 
 
 def depth_delay_ns(frontend: Path) -> int:
