@@ -125,7 +125,8 @@ class DepthColorConsistency:
     """A frame that looks worse than usual must be where color alone puts it, as far as that can be determined.
 
     If the two contradict each other, depth of another time holds the camera back: then the pose by color alone is
-    used, unless by it the camera moved less, or something is in front of the camera.
+    used, unless by it the camera moved less, or something is in front of the camera. But color alone also goes along
+    with light that moves with the camera, of its lamp or a flare: they do not, where features prefer the other pose.
     """
 
     def judge(
@@ -146,8 +147,7 @@ class DepthColorConsistency:
             return Reason.CONTRADICTION if state.depth_color_inconsistent else candidate
         T, T_color_only = state.in_keyframe(candidate), color_only.T_reference_target
         agree = state.last_good.agrees(T, T_color_only, limits, state.depth_color_inconsistent)
-        weak = state.weakly_predicted(state.predict(frame.stamp_ns))
-        if agree or (weak and _features_prefer(T, T_color_only, state.keyframe, frame)):
+        if agree or _features_prefer(T, T_color_only, state.keyframe, frame):
             return replace(candidate, unlike=True)
         state.depth_color_inconsistent = True
         view, viewpoint = frame.pyramid.levels[-1], state.viewpoint(candidate)

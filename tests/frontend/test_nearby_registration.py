@@ -12,6 +12,7 @@ from duagc.pipeline.frontend import feature_checks, nearby_registration
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
+from duagc.pipeline.frontend.pose_checks import DepthColorConsistency
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Outcome
@@ -236,3 +237,32 @@ def test_color_alone_does_not_take_the_place_of_color_and_depth(
     assert isinstance(found, PoseCandidate)
     assert found.without is Reason.NONE
     assert distance_m(run, state, found) == pytest.approx(0.02, abs=2e-3)
+
+
+@pytest.mark.parametrize("off_m", [0.03, -0.03])
+def test_features_decide_whether_color_alone_contradicts_depth(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch, off_m: float
+) -> None:
+    """A pattern of light that moves with the camera takes color alone along; late depth holds back the other pose."""
+    state, frame = prepared(run)
+    predicted = state.predict(frame.stamp_ns)
+    assert not state.weakly_predicted(predicted)
+    right = nearby_registration.register_predicted(
+        state, frame, predicted, state.config.tracking.registration
+    )
+    off = right.T_reference_target @ se3.exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    wrong = replace(right, T_reference_target=off)
+
+    def judged(both: registration.Registration, color: registration.Registration) -> PoseCandidate | Reason:
+        state.depth_color_inconsistent = False
+        monkeypatch.setattr(state, "register_color", lambda frame: color)
+        unusual = replace(both, rms_gray=2.0 * state.usual_gray_rms)
+        candidate = PoseCandidate(state.keyframe_index, unusual)
+        return DepthColorConsistency().judge(state, frame, candidate)
+
+    found = judged(right, wrong)
+    assert isinstance(found, PoseCandidate)
+    assert found.without is Reason.NONE
+    assert distance_m(run, state, found) < 2e-3
+    found = judged(wrong, right)
+    assert found is Reason.CONTRADICTION or distance_m(run, state, found) < 2e-3
