@@ -58,7 +58,8 @@ class RegistrationConfig(Config):
     max_gray_rms: float = 0.15
     """Largest weighted gray residual; more is RESIDUAL."""
     max_gain: float = 2.0
-    """The gain must lie between 1 / max_gain and max_gain; else RESIDUAL (covered lens, other scene)."""
+    """The gain must lie between 1 / max_gain and max_gain; else RESIDUAL (covered lens, other scene). It may be smaller
+    where both views show the same textures: noise in the dark and a lamp on the camera make it too small."""
     max_sigma_m: float = 0.03
     """Directions with a larger standard deviation at the median depth are weak: they stay at the guess, or where the
     prior pulls them, and carry no information. The outcome is ILL_CONDITIONED unless the prior knows better. As limits

@@ -22,6 +22,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import compiled, search
+from duagc.pipeline.registration.image_agreement import same_under_other_light
 from duagc.pipeline.registration.normal_equations import System, excess, regular
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
@@ -131,7 +132,14 @@ def register(
         T, exposure, system = minimum(found.projection)
         found = _Determined.by(system, config).without(found)
     return _judge(
-        system, found, T, guess, exposure=exposure, config=config, prior_information=prior_information
+        system,
+        found,
+        T,
+        guess,
+        views=(reference, pyramid),
+        exposure=exposure,
+        config=config,
+        prior_information=prior_information,
     )
 
 
@@ -169,7 +177,14 @@ def linearize(
     step = search.step(system, T, T, None, projection=found.projection)
     T_minimum, exposure_minimum = T @ se3.exp(step[:6]), start + step[6:]
     return _judge(
-        system, found, T_minimum, T, exposure=exposure_minimum, config=config, prior_information=None
+        system,
+        found,
+        T_minimum,
+        T,
+        views=(reference, pyramid),
+        exposure=exposure_minimum,
+        config=config,
+        prior_information=None,
     )
 
 
@@ -241,6 +256,7 @@ def _judge(
     T: Array,
     guess: Array,
     *,
+    views: tuple[Reference, RgbdPyramid],
     exposure: Array,
     config: RegistrationConfig,
     prior_information: Array | None,
@@ -257,7 +273,11 @@ def _judge(
         system.seen.conflict > config.max_conflict
         or system.depth.scale > config.max_depth_scale
         or system.gray.rms > config.max_gray_rms
-        or not 1 / config.max_gain < gain < config.max_gain
+        or gain >= config.max_gain
+        # noise of the reference, or a lamp on the camera, makes it too small, but never too large
+        or not (
+            gain > 1 / config.max_gain or same_under_other_light(*views, T, min_samples=config.min_samples)
+        )
     ):
         outcome = Outcome.RESIDUAL
     elif weakest * _max_sigma_m(system, config) ** 2 < 1 - 1e-9:

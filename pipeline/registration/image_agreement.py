@@ -21,6 +21,7 @@ MIN_CONTRAST = 0.04  # standard deviation of gray values (0..1) in either view f
 MIN_CORRELATION = 0.5  # of a part that looks alike
 MIN_PARTS = 4  # with texture; fewer decide nothing
 NOISE = 0.01  # of gray values at the coarsest level
+NEAR_PX = 5  # side of the squares within which light hardly differs, at the next to coarsest level
 
 
 def share_alike(reference: Reference, target: RgbdPyramid, T_reference_target: Array) -> float:
@@ -34,19 +35,53 @@ def share_alike(reference: Reference, target: RgbdPyramid, T_reference_target: A
     Returns:
         0 to 1; 1 where too little texture is seen by both to decide.
     """
-    level, samples = target.levels[-1], reference.levels[len(target.levels) - 1]
-    points = se3.transform(se3.inverse(T_reference_target), samples.points.astype(np.float64))
-    index, column, row = visible(level.camera, points, margin_px=1)
-    inverse = level.usable_inverse_depth[row, column].astype(np.float64)
-    same = inverse > 0
-    if level.has_depth:
-        same &= np.abs(points[index, 2] * inverse - 1) < SAME_SURFACE
-    index, column, row = index[same], column[same], row[same]
-    seen = bilinear(level.gray, *level.camera.project(points[index]).T).astype(np.float64)
-    given = samples.intensities[index].astype(np.float64)
+    level = target.levels[-1]
+    given, seen, row, column = _shared(reference, target, T_reference_target, len(target.levels) - 1)
     rows, columns = PARTS
     part = (row * rows // level.camera.height) * columns + column * columns // level.camera.width
     return _share(part, given, seen)
+
+
+def same_under_other_light(
+    reference: Reference, target: RgbdPyramid, T_reference_target: Array, *, min_samples: int
+) -> bool:
+    """Whether what both views show differs from place to place alike, however light and noise are.
+
+    Under a lamp on the camera, or where the image is dark, one gain does not relate two views: the lamp's pattern moves
+    with the camera, and noise of the reference makes the gain too small. The correlation of gray values less their
+    means over small squares keeps the texture. A covered lens has none, and that of another place does not correlate.
+
+    Args:
+        reference: samples of one view.
+        target: the other view.
+        T_reference_target: [4, 4], where registration has the target.
+        min_samples: fewer that both see decide against it.
+    """
+    index = max(len(target.levels) - 2, 0)
+    given, seen, row, column = _shared(reference, target, T_reference_target, index)
+    if len(given) < min_samples:
+        return False
+    columns = target.levels[index].camera.width // NEAR_PX + 1
+    part = (row // NEAR_PX) * columns + column // NEAR_PX
+    count = np.maximum(np.bincount(part), 1)
+    a, b = (values - (np.bincount(part, values) / count)[part] for values in (given, seen))
+    return bool(a @ b >= MIN_CORRELATION * np.sqrt((a @ a) * (b @ b)) > 0)
+
+
+def _shared(
+    reference: Reference, target: RgbdPyramid, T_reference_target: Array, index: int
+) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Gray values [n] of the samples that a target sees on the same surface, its own there, and rows and columns."""
+    level, samples = target.levels[index], reference.levels[index]
+    points = se3.transform(se3.inverse(T_reference_target), samples.points.astype(np.float64))
+    seen, column, row = visible(level.camera, points, margin_px=1)
+    inverse = level.usable_inverse_depth[row, column].astype(np.float64)
+    same = inverse > 0
+    if level.has_depth:
+        same &= np.abs(points[seen, 2] * inverse - 1) < SAME_SURFACE
+    seen, column, row = seen[same], column[same], row[same]
+    gray = bilinear(level.gray, *level.camera.project(points[seen]).T).astype(np.float64)
+    return samples.intensities[seen].astype(np.float64), gray, row, column
 
 
 def _share(part: NDArray[np.int64], given: Array, seen: Array) -> float:
