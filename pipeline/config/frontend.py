@@ -285,7 +285,7 @@ class TrackingConfig(Config):
     max_gain_step: float = Field(default=1.15, ge=1.0)
     """Factor up to which two frames in a row are exposed alike: an exposure that drifts does not jump."""
     max_saturated: float = 0.1
-    """Share of black and white pixels up to which that is so."""
+    """Share of black and white pixels, beyond that of the keyframe, up to which that is so."""
     failure: FailureConfig = FailureConfig()
     relocalization: RelocalizationConfig = RelocalizationConfig()
     prior: MotionPriorConfig = MotionPriorConfig()

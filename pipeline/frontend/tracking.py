@@ -19,7 +19,7 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
-from duagc.pipeline.frontend.failure import Reason, saturated_share
+from duagc.pipeline.frontend.failure import Reason, saturated_share, saturated_share_of
 from duagc.pipeline.frontend.frame_images import Image, RgbdImages
 from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
 from duagc.pipeline.frontend.keyframe_insertion import insert_first_keyframe, insert_keyframe
@@ -326,17 +326,19 @@ class Tracker:
         return abs(depth_offset_ns) * 1e-9 <= self.state.max_depth_offset_s
 
     def _is_well_exposed(self, pyramid: RgbdPyramid, result: Registration) -> bool:
-        """Whether a frame looks as its keyframe does; or, hardly saturated, leaves it or drifts from its exposure.
+        """Whether a frame looks as its keyframe does; or, hardly more saturated, leaves it or drifts from its exposure.
 
-        Where the exposure jumps, too dark and too bright images pass. They make poor keyframes.
+        Where the exposure jumps, too dark and too bright images pass. They make poor keyframes. In a dark place all
+        images are partly black.
         """
         if self.state.looks_as_usual(result):
             return True
-        tracking = self.state.config.tracking
+        tracking, samples = self.state.config.tracking, self.state.keyframe.reference.levels[0]
         leaving = min(result.overlap, result.view) < tracking.relocalization.min_overlap
-        return (leaving or self.state.drifts(result)) and saturated_share(
-            pyramid.levels[0]
-        ) <= tracking.max_saturated
+        if not (leaving or self.state.drifts(result)):
+            return False
+        before = saturated_share_of(samples.intensities)
+        return saturated_share(pyramid.levels[0]) - before <= tracking.max_saturated
 
     def _promote(self, frame: CurrentFrame, found: PoseCandidate, status: Status) -> TrackedFrame:
         """Make a tracked frame the next keyframe; then anchored to itself, with the information of its tracking."""
