@@ -255,10 +255,18 @@ class MotionReader:
         topic, frame = self._settings.imu, self._imu.frame
         times, first = np.unique(np.array(self._imu.stamps, dtype=np.int64), return_index=True)
         values = np.array(self._imu.values, dtype=np.float64).reshape(-1, 6)[first]
-        if not np.isfinite(values).all():
+        sound = np.asarray(np.isfinite(values).all(axis=1))
+        if len(values) and not sound.any():
             raise DuagError(
-                f"{self.name}: {topic} holds numbers that are not finite, expected rad/s and m/s^2"
+                f"{self.name}: {topic} holds no message of finite numbers, expected rad/s and m/s^2"
             )
+        if not sound.all():
+            at_s = times[np.argmin(sound)] / NANOSECONDS
+            self.warnings.append(
+                f"{topic}: {np.count_nonzero(~sound)} of {len(values)} messages hold numbers that are not finite, "
+                f"the first at {at_s:.3f} s; left out"
+            )
+        times, values = times[sound], values[sound]
         if not values[:, :3].any():
             self.warnings.append(
                 f"{topic}: all turning rates are zero, as of an accelerometer alone; left out"

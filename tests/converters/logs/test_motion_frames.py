@@ -134,6 +134,22 @@ def test_an_imu_that_measures_no_turning_is_left_out(tmp_path: Path) -> None:
     assert not list(read_log(out / "alpha.mcap", ["/alpha/imu"]))
 
 
+def test_a_message_of_an_imu_that_is_no_number_is_left_out(tmp_path: Path) -> None:
+    r, lost = Ros(2), np.full(3, np.nan)
+    rates = [np.array([0.1, 0.2, 0.3]) for _ in TIMES]
+    rates[1] = lost
+    rows = still(r) + [("/imu", t, imu(r, t, "c", rate)) for t, rate in zip(TIMES, rates, strict=True)]
+    out = convert(r, tmp_path, rows, "imu=/imu")
+    said = f"1 of {len(TIMES)} messages hold numbers that are not finite, the first at {TIMES[1] / 1e9:.3f} s"
+    assert any(f"/imu: {said}; left out" in w for w in warnings_of(out))
+    assert len(list(read_log(out / "alpha.mcap", ["/alpha/imu"]))) == len(TIMES) - 1
+    rows = still(r) + [("/imu", t, imu(r, t, "c", lost)) for t in TIMES]
+    with pytest.raises(DuagError, match="/imu holds no message of finite numbers"):
+        registry.convert(
+            "ros", r.write(tmp_path / "lost", rows, "mcap"), tmp_path / "r", options=["imu=/imu"]
+        )
+
+
 def test_frames_without_a_name_are_tied_by_nothing(tmp_path: Path) -> None:
     """Nobody said where an IMU is: that it has the axes of the camera would be a guess."""
     r = Ros(2)
