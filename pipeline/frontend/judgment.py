@@ -3,8 +3,9 @@
 The joint optimization finds the poses that explain the images best, starting from tracking. Where tracking went wrong
 it ends in a wrong minimum, and its residuals look as usual. Matched features and free space are other evidence: they
 took no part in it. A pair is contradicted if features that agree on one motion are far from where the poses have them,
-or if one view stands in space that the other saw to be free. What contradicted pairs cut off from the largest part of
-the path is not where the poses have it.
+or if one view stands in space that the other saw to be free. Features may be of something that moves with the camera,
+which depth does not show: where others agree with the poses, images must support the motion of those that do not. What
+contradicted pairs cut off from the largest part of the path is not where the poses have it.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig, JudgmentConfig
-from duagc.pipeline.frontend.bundle import KeyframeView
+from duagc.pipeline.frontend.bundle import Images, KeyframeView
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
-from duagc.pipeline.registration import Level
+from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid, register
 from duagc.pipeline.registration.feature_judgment import FeatureJudgment, judge_motion
 
 Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
@@ -87,6 +90,7 @@ def judge(
     factors: Sequence[RelativePose],
     config: FrontendConfig,
     *,
+    images: Images,
     seed: int,
     robot: str,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
@@ -99,6 +103,7 @@ def judge(
         views: of the k keyframes.
         factors: which keyframes see each other.
         config: limits.
+        images: reads the images of a keyframe.
         seed: of the random stream.
         robot: of the random stream.
         checkpoints: of the stage.
@@ -122,6 +127,14 @@ def judge(
             verdicts[ends] = _by_depth(views[first].coarsest, views[second].coarsest, T_first_second, config)
         elif not contradicts(found, limits):
             verdicts[ends] = PairVerdict.CONFIRMED
+        elif found.with_given >= limits.min_inliers and not _images_support(
+            found.T_first_second,
+            views[first],
+            images(second, len(views[first].reference.levels)),
+            config.tracking.registration,
+            T_given=T_first_second,
+        ):
+            verdicts[ends] = _by_depth(views[first].coarsest, views[second].coarsest, T_first_second, config)
         else:
             verdicts[ends] = PairVerdict.FEATURES
             by_features.append(RelativePose(first, second, found.T_first_second, found.information))
@@ -160,6 +173,20 @@ def contradicts(found: FeatureJudgment, limits: JudgmentConfig) -> bool:
         limits: how far they may be.
     """
     return found.given_rad > max(limits.max_angle_rad, limits.max_angle_of_own * found.own_rad)
+
+
+def _images_support(
+    T_features: Array, view: KeyframeView, pyramid: RgbdPyramid, config: RegistrationConfig, *, T_given: Array
+) -> bool:
+    """Whether a registration from the motion [4, 4] that features agree on ends nearer to it than to the given one."""
+    result = register(view.reference, pyramid, T_features, config)
+    depth_m = float(np.median(view.features.points[:, 2]))
+
+    def away_rad(T: Array) -> float:
+        moved_m, turned_rad = se3.distance(result.T_reference_target, T)
+        return float(moved_m / depth_m + turned_rad)
+
+    return result.ok and away_rad(T_features) < away_rad(T_given)
 
 
 def _by_depth(first: Level, second: Level, T_first_second: Array, config: FrontendConfig) -> PairVerdict:

@@ -129,6 +129,7 @@ class PathOptimization:
                 path.keyframes,
                 path.factors,
                 self.config,
+                images=lambda index, levels: self.images(path.keyframes[index].frame_index, levels),
                 seed=self.seed,
                 robot=self.robot,
                 checkpoints=self.checkpoints,

@@ -9,7 +9,7 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration.feature_motion import inliers_needed, matched_features
+from duagc.pipeline.registration.feature_motion import agreeing, inliers_needed, matched_features
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.matched_points import information_of_fit, ransac
 
@@ -22,6 +22,7 @@ class FeatureJudgment:
 
     Attributes:
         inliers: number of these.
+        with_given: number of all matches that agree with the given motion.
         given_rad: median angle between a feature and its partner moved by the given motion.
         own_rad: the same by the motion that they agree on.
         T_first_second: [4, 4], that motion.
@@ -29,6 +30,7 @@ class FeatureJudgment:
     """
 
     inliers: int
+    with_given: int
     given_rad: float
     own_rad: float
     T_first_second: Array
@@ -60,7 +62,14 @@ def judge_motion(
         return None
     ours, theirs = points[0][agree], points[1][agree]
     given, own = (_median_angle(ours, theirs, T) for T in (T_first_second, T_own))
-    return FeatureJudgment(int(agree.sum()), given, own, T_own, information_of_fit(ours, theirs, T_own))
+    return FeatureJudgment(
+        int(agree.sum()),
+        int(agreeing(*points, T_first_second, config).sum()),
+        given,
+        own,
+        T_own,
+        information_of_fit(ours, theirs, T_own),
+    )
 
 
 def angles_between(points: Array, others: Array) -> Array:

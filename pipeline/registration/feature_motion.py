@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig
@@ -179,6 +180,20 @@ def follows_something_moved(
         return False
     agree = _apart(*points, T_first_second, config) < 1
     return another.spread_m > _spread_m(points[1][agree])
+
+
+def agreeing(
+    points_first: Array, points_second: Array, T_first_second: Array, config: GeometricVerificationConfig
+) -> NDArray[np.bool_]:
+    """Which matched points [n] agree with a motion.
+
+    Args:
+        points_first: [n, 3], meters, camera frame of the first view.
+        points_second: [n, 3], the same points in the camera frame of the second.
+        T_first_second: the motion, [4, 4].
+        config: distance of an inlier.
+    """
+    return np.asarray(_apart(points_first, points_second, T_first_second, config) < 1)
 
 
 def _apart(

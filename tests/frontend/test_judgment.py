@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
+from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.judgment import Judgment, PairVerdict, judge
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
+from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.registration.features import Features
+from tests.fixtures.films import CAMERA
 from tests.frontend.conftest import CONFIG, STARTS
 
 OFF = se3.exp(np.array([0.12, 0.0, 0.05, 0.0, 0.03, 0.0]))
@@ -25,10 +28,25 @@ def tracker(run: Undisturbed) -> Tracker:
     return run.tracker(STARTS[-1])
 
 
+@pytest.fixture(scope="module")
+def images(tracker: Tracker, run: Undisturbed) -> Images:
+    shots = {shot.index: shot for shot in run.shots}
+
+    def of(index: int, levels: int) -> RgbdPyramid:
+        shot = shots[tracker.keyframes[index].frame_index]
+        return RgbdPyramid.build(shot.color.astype(np.float32) / 255, shot.depth, CAMERA, levels)
+
+    return of
+
+
+def no_images(index: int, levels: int) -> RgbdPyramid:
+    raise AssertionError("features leave nothing to be asked of images")
+
+
 def judged(tracker: Tracker, T_map_keyframe: np.ndarray, *, features: bool = True) -> Judgment:
     none = Features(np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
     views = [k if features else replace(k, features=none) for k in tracker.keyframes]
-    return judge(T_map_keyframe, views, tracker.pairs, CONFIG, seed=0, robot="alpha")
+    return judge(T_map_keyframe, views, tracker.pairs, CONFIG, images=no_images, seed=0, robot="alpha")
 
 
 def poses(tracker: Tracker) -> np.ndarray:
@@ -93,3 +111,27 @@ def test_without_features_depth_contradicts(tracker: Tracker) -> None:
     T[-1] = T[-1] @ se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
     found = judged(tracker, T, features=False)
     assert found.contradicted == {len(T) - 1: Reason.CONTRADICTED_BY_DEPTH}
+
+
+@pytest.mark.parametrize("given_is_true", [True, False])
+def test_where_features_show_two_motions_images_decide(
+    tracker: Tracker, images: Images, given_is_true: bool
+) -> None:
+    """Most are of hands that move with the camera; or tracking went wrong, and some are of what looks alike."""
+    T = poses(tracker)[:2]
+    truth = se3.inverse(T[0]) @ T[1]
+    other = truth @ se3.exp(np.array([0.05, 0.0, 0.02, 0.0, 0.04, 0.0]))
+    if not given_is_true:
+        T[1] = T[0] @ other
+    of_most, of_some = (other, truth) if given_is_true else (truth, other)
+    rng = np.random.default_rng(0)
+    theirs = rng.uniform([-0.8, -0.6, 1.0], [0.8, 0.6, 2.0], (100, 3))
+    moves = [of_most] * 60 + [of_some] * 40
+    ours = np.array([se3.transform(move, point[None])[0] for move, point in zip(moves, theirs, strict=True)])
+    descriptors = rng.integers(0, 256, (100, 128)).astype(np.uint8)
+    views = [
+        replace(keyframe, features=Features(descriptors, points.astype(np.float32)))
+        for keyframe, points in zip(tracker.keyframes, (ours, theirs), strict=False)
+    ]
+    found = judge(T, views, [], CONFIG, images=images, seed=0, robot="alpha")
+    assert found.verdicts[0, 1].contradicts is not given_is_true
