@@ -25,7 +25,6 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import RgbdLog
-from duagc.pipeline.recording.moved_depth import DepthMotion
 from duagc.pipeline.registration import Outcome
 
 STEP_NS = 10_000_000  # in which a velocity is taken
@@ -184,7 +183,7 @@ def estimated_time(found: Sequence[MotionDifference], config: MotionTimeConfig) 
 
 def _views(log: RgbdLog, part: Trajectory) -> list[MovingView]:
     """Frames with depth, pose and velocity that are not held out."""
-    motion, index_of = DepthMotion(part), {color: k for k, (color, _) in enumerate(log.pairing.pairs)}
+    motion, index_of = log.motion_along(part), {color: k for k, (color, _) in enumerate(log.pairing.pairs)}
     found = []
     for stamp, T in zip(part.stamps_ns.tolist(), part.poses, strict=True):
         index = index_of[stamp]

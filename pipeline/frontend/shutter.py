@@ -29,7 +29,6 @@ from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from duagc.pipeline.kernels.sparse_steps import LookedAt, checkerboards
 from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView, step_in_place
 from duagc.pipeline.recording import RgbdLog
-from duagc.pipeline.recording.moved_depth import DepthMotion
 from duagc.pipeline.splat.gaussians import Gaussians
 
 FRAMES = 24
@@ -102,7 +101,7 @@ class ShutterSearch:
         self._level = int(log.camera.width * log.camera.height > MAX_PIXELS)
         self._camera = log.camera.halved() if self._level else log.camera
         self._config, self._read, self._threads = config, read, threads
-        self._motion = DepthMotion(path)
+        self._motion = log.motion_along(path)
         self._T_map_camera = dict(zip(path.stamps_ns.tolist(), path.poses, strict=True))
         weights = LossWeights(**config.loss.of(depth).model_dump())
         self._step = TrainingStep(Rasterizer(threads=threads), weights, depth)

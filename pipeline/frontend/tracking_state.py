@@ -18,11 +18,11 @@ from duagc.pipeline.frontend.failure import (
     OcclusionDetector,
     Viewpoint,
 )
-from duagc.pipeline.frontend.gyro_calibration import FEWEST, MOST, GyroCorrection, Turn
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Motion, MotionPrior
+from duagc.pipeline.recording.gyro_calibration import FEWEST, MOST, GyroCorrection, Turn
 from duagc.pipeline.registration import Registration
 
 EXTRAPOLATED_INTERVALS = 1.5

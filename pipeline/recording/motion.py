@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duagc.pipeline import messages
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.recording.depth_sources import constant, transform_rows
+from duagc.pipeline.recording.gyro_calibration import GyroCorrection
 from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics as topic_table
 
@@ -100,19 +103,46 @@ class GyroPrior:
             start_ns: time of the first pose, ns.
             stop_ns: time of the second pose, ns, not earlier.
         """
+        if (used := self._used(start_ns, stop_ns)) is None:
+            return None
+        edges, R = self._edges(used, start_ns, stop_ns), np.eye(3)
+        for rate, seconds in zip(self.rates_camera[used], np.diff(edges) * 1e-9, strict=True):
+            R = R @ so3.exp(rate * seconds)
+        return Motion(se3.from_rotation_translation(R, np.zeros(3)), knows_translation=False)
+
+    def turns(self, start_ns: int, times_ns: NDArray[np.int64], correction: GyroCorrection) -> Array | None:
+        """Rotations R_start_then [n, 3, 3] to some times; None where the rates do not reach or have a gap.
+
+        Args:
+            start_ns: from which they are.
+            times_ns: [n], before it or after it.
+            correction: of the rates.
+        """
+        first_ns, last_ns = min(start_ns, int(times_ns.min())), max(start_ns, int(times_ns.max()))
+        if (used := self._used(first_ns, last_ns)) is None:
+            return None
+        rates = self.rates_camera[used] @ correction.R_camera_gyro.T - correction.bias
+        edges = self._edges(used, first_ns, last_ns)
+        steps = so3.exp(rates * (1e-9 * np.diff(edges))[:, None])
+        R_first_edge = np.array(list(accumulate(steps[:-1], np.matmul, initial=np.eye(3))))
+        times = np.append(times_ns, start_ns)
+        at = np.searchsorted(edges[1:-1], times, side="right")
+        R = R_first_edge[at] @ so3.exp(rates[at] * (1e-9 * (times - edges[at]))[:, None])
+        return np.asarray(R[-1].T @ R[:-1])
+
+    def _used(self, start_ns: int, stop_ns: int) -> slice | None:
+        """The rates from one time to another."""
         stamps = self.stamps_ns
         first, last = (int(np.searchsorted(stamps, t)) for t in (start_ns, stop_ns))
         if len(stamps) < 2 or start_ns < stamps[0] or stop_ns > stamps[-1]:
             return None
         used = slice(max(first - 1, 0), last + 1)
-        if np.any(np.diff(stamps[used]) > LONGEST_RATE_GAP_NS):
-            return None
-        middles = (stamps[used][:-1] + stamps[used][1:]) // 2
-        edges = np.clip(np.concatenate([[start_ns], middles, [stop_ns]]), start_ns, stop_ns)
-        R = np.eye(3)
-        for rate, seconds in zip(self.rates_camera[used], np.diff(edges) * 1e-9, strict=True):
-            R = R @ so3.exp(rate * seconds)
-        return Motion(se3.from_rotation_translation(R, np.zeros(3)), knows_translation=False)
+        return None if np.any(np.diff(stamps[used]) > LONGEST_RATE_GAP_NS) else used
+
+    def _edges(self, used: slice, start_ns: int, stop_ns: int) -> NDArray[np.int64]:
+        """Times [rates + 1] between which rates hold."""
+        middles = (self.stamps_ns[used][:-1] + self.stamps_ns[used][1:]) // 2
+        return np.clip(np.concatenate([[start_ns], middles, [stop_ns]]), start_ns, stop_ns)
 
 
 def motion_prior(log: LogFile, robot: str) -> MotionPrior | None:
@@ -136,6 +166,19 @@ def motion_prior(log: LogFile, robot: str) -> MotionPrior | None:
             except DuagError as error:
                 raise DuagError(f"{log.path}: {topic} at {time} ns: {error}") from error
         return OdometryPrior(times, np.array(poses))
+    return gyro_prior(log, robot)
+
+
+def gyro_prior(log: LogFile, robot: str) -> GyroPrior | None:
+    """The gyroscope of a log's IMU; None if it has none.
+
+    Args:
+        log: of the robot.
+        robot: whose topics are read.
+
+    Raises:
+        DuagError: a message that cannot be read, or an IMU without its pose in the camera.
+    """
     topic = topic_table.IMU.of(robot)
     if not log.entries(topic):
         return None

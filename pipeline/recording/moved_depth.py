@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.depth_sources import DepthImage
+from duagc.pipeline.recording.gyro_calibration import FEWEST, GyroCorrection, Turn
+from duagc.pipeline.recording.motion import GyroPrior
 from duagc.pipeline.recording.read import log_metadata, read_log
 from duagc.schemas import topics
 
@@ -26,7 +30,25 @@ REACH_NS = 250_000_000  # from a frame to those by which its motion is known
 FRAMES_AROUND = 3  # of these, before and after it
 DEGREE, DEGREE_OF_SHAKES = 2, 4  # of the curve through their poses
 COMPARED_FRAMES = 100  # of a part, by which the degree is chosen
+MOST_OFF = (
+    0.5  # of the motion from one frame to the next: poses that are farther from their curves do not tell it
+)
 SHAKES_FROM = 2.0  # times the errors of the higher degree, of a parabola: most of these are motion then
+
+
+@dataclass(frozen=True)
+class _CurveKind:
+    """How the motion around the frames of a part is described.
+
+    Attributes:
+        degree: of the curves.
+        gyro: correction of the gyroscope that gives the rotations; None: the curves do.
+        predicts: whether these tell how the camera moved between its frames.
+    """
+
+    degree: int = DEGREE
+    gyro: GyroCorrection | None = None
+    predicts: bool = True
 
 
 class DepthMotion:
@@ -36,17 +58,21 @@ class DepthMotion:
     smooth curve through the poses of the frames around, not that from one to the next. A parabola would be smoother
     than a camera that shakes: where a curve of higher degree predicts poses from those around them clearly better, what
     a parabola leaves is motion, not the errors of poses.
+
+    A gyroscope that knows the turns between frames better than the curve does gives the rotations, and the curve the
+    translations alone.
     """
 
-    def __init__(self, *parts: Trajectory) -> None:
+    def __init__(self, *parts: Trajectory, gyro: GyroPrior | None = None) -> None:
         """Keep the poses; the curve around a frame is fitted when it is first needed.
 
         Args:
             parts: T_map_camera of the tracked frames; of every part that has a frame of its own.
+            gyro: of the log; None: it has none.
         """
-        self._parts = parts
-        self._degrees: dict[int, int] = {}  # by the number of a part
-        self._curves: dict[int, Array | None] = {}  # by the time of a frame
+        self._parts, self._gyro = parts, gyro
+        self._kinds: dict[int, _CurveKind] = {}  # by the number of a part
+        self._curves: dict[int, tuple[_CurveKind, Array] | None] = {}  # by the time of a frame
 
     def between(self, color_ns: int, depth_ns: int) -> Array | None:
         """T_color_depth [4, 4], from the camera when depth was taken to the camera when color was.
@@ -73,20 +99,26 @@ class DepthMotion:
         """
         if color_ns not in self._curves:
             self._curves[color_ns] = self._curve(color_ns)
-        curve = self._curves[color_ns]
-        if curve is None:
+        if (found := self._curves[color_ns]) is None:
             return None
-        then = np.vander(1e-9 * (times_ns - color_ns), len(curve)) @ curve
-        return np.asarray(se3.inverse(se3.exp(curve[-1])) @ se3.exp(then))
+        kind, curve = found
+        T = _along(curve, color_ns, times_ns)
+        if self._gyro is not None and kind.gyro is not None:
+            turns = self._gyro.turns(color_ns, times_ns, kind.gyro)
+            if turns is not None:
+                T[:, :3, :3] = turns
+        return T
 
-    def _curve(self, color_ns: int) -> Array | None:
-        """The curve around a frame."""
+    def _curve(self, color_ns: int) -> tuple[_CurveKind, Array] | None:
+        """The curve around a frame, and of what kind it is."""
         for number, part in enumerate(self._parts):
             at = int(np.searchsorted(part.stamps_ns, color_ns))
             if at < len(part.stamps_ns) and part.stamps_ns[at] == color_ns:
-                if number not in self._degrees:
-                    self._degrees[number] = _degree_of(part)
-                return _curve_in(part, at, self._degrees[number])
+                if number not in self._kinds:
+                    self._kinds[number] = _kind_of(part, self._gyro)
+                kind = self._kinds[number]
+                curve = _curve_in(part, at, kind.degree) if kind.predicts else None
+                return None if curve is None else (kind, curve)
         return None
 
 
@@ -115,19 +147,57 @@ def _curve_in(part: Trajectory, at: int, degree: int = DEGREE) -> Array | None:
     return _fitted(part, at, chosen, degree)
 
 
-def _degree_of(part: Trajectory) -> int:
-    """Degree of the curves, by how far poses are from curves through those around them (m, and rad as if at 1 m)."""
-    some = evenly_spaced(len(part), min(COMPARED_FRAMES, len(part)))
-    off: dict[int, list[float]] = {DEGREE: [], DEGREE_OF_SHAKES: []}
-    for at in (int(k) for k in some):
+def _along(curve: Array, color_ns: int, times_ns: NDArray[np.int64]) -> Array:
+    """T_color_then [n, 4, 4] along a curve."""
+    then = np.vander(1e-9 * (times_ns - color_ns), len(curve)) @ curve
+    return np.asarray(se3.inverse(se3.exp(curve[-1])) @ se3.exp(then))
+
+
+def _kind_of(part: Trajectory, gyro: GyroPrior | None) -> _CurveKind:
+    """Of what kind curves are, by how far poses are from curves through those around them."""
+    some = [int(k) for k in evenly_spaced(len(part), min(COMPARED_FRAMES, len(part)))]
+    off: dict[int, list[Array]] = {DEGREE: [], DEGREE_OF_SHAKES: []}
+    steps = []
+    for at in some:
         chosen = _around(part, at)
         if len(chosen) == 2 * FRAMES_AROUND + 1 and chosen[FRAMES_AROUND] == at:
+            steps.append(se3.log(se3.inverse(part.poses[at]) @ part.poses[at + 1]))
             for degree, of_degree in off.items():
-                of_degree.append(float(np.linalg.norm(_fitted(part, at, chosen[chosen != at], degree)[-1])))
+                of_degree.append(_fitted(part, at, chosen[chosen != at], degree)[-1])
     if not off[DEGREE]:
-        return DEGREE
-    shakes = np.median(off[DEGREE]) > SHAKES_FROM * np.median(off[DEGREE_OF_SHAKES])
-    return DEGREE_OF_SHAKES if shakes else DEGREE
+        return _CurveKind()
+    degree = _degree_by(off, slice(6))
+    correction, off_rad = (None, np.inf) if gyro is None else _compared(part, gyro, some)
+    if off_rad < np.median(np.linalg.norm(np.array(off[degree])[:, 3:], axis=1)):
+        return _CurveKind(_degree_by(off, slice(3)), correction)
+    off_step, step = (float(np.linalg.norm(tangents, axis=1).mean()) for tangents in (off[degree], steps))
+    return _CurveKind(degree, predicts=off_step <= MOST_OFF * step)
+
+
+def _degree_by(off: Mapping[int, Sequence[Array]], of_tangents: slice) -> int:
+    """Degree of the curves, by how far poses are from those of either degree (m, and rad as if at 1 m)."""
+    medians = {
+        degree: np.median(np.linalg.norm(np.array(of_degree)[:, of_tangents], axis=1))
+        for degree, of_degree in off.items()
+    }
+    return DEGREE_OF_SHAKES if medians[DEGREE] > SHAKES_FROM * medians[DEGREE_OF_SHAKES] else DEGREE
+
+
+def _compared(part: Trajectory, gyro: GyroPrior, some: Sequence[int]) -> tuple[GyroCorrection | None, float]:
+    """The correction of a gyroscope by turns between frames, and the median of what is left of them, rad."""
+    found = []
+    for at in some[:-1] if some[-1] == len(part) - 1 else some:
+        start_ns, stop_ns = (int(t) for t in part.stamps_ns[at : at + 2])
+        motion = gyro.between(start_ns, stop_ns) if stop_ns - start_ns <= REACH_NS else None
+        if motion is not None:
+            by_images = part.poses[at, :3, :3].T @ part.poses[at + 1, :3, :3]
+            found.append((1e-9 * (stop_ns - start_ns), motion.T_start_stop[:3, :3], by_images))
+    if len(found) < FEWEST:
+        return None, np.inf
+    turns = [Turn(so3.log(by_gyro) / s, so3.log(by_images) / s) for s, by_gyro, by_images in found]
+    correction = GyroCorrection.of(turns, 0.0)
+    left = [so3.log(by_images.T @ correction.corrected(by_gyro, s)) for s, by_gyro, by_images in found]
+    return correction, float(np.median(np.linalg.norm(left, axis=1)))
 
 
 def depth_delay_ns(frontend: Path) -> int:

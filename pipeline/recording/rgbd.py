@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from duagc.pipeline.geometry.open_shutter import OpenShutter
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.color_images import ColorImages
 from duagc.pipeline.recording.depth_sources import DepthImage, Lidar, check_size, constant, depth_source
-from duagc.pipeline.recording.motion import MotionPrior, motion_prior
+from duagc.pipeline.recording.mask_topics import mask_entries, valid_pixels
+from duagc.pipeline.recording.motion import GyroPrior, MotionPrior, gyro_prior, motion_prior
 from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, move_depth, tracked_frames
 from duagc.pipeline.recording.pairing import pair, pair_topics
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile
@@ -89,7 +91,7 @@ class RgbdLog:
             raise DuagError(f"{self.path}: {self._color_topic} has no message, expected images")
         self.camera, self.lens = self._read_camera()
         self._images = ColorImages(self.camera, self.lens)
-        self.valid = self._read_valid()
+        self.valid = valid_pixels(self._log, self.robot, self.camera)
         self._source = depth_source(self._log, self.robot, self.camera)
         self.depth_scale = self._source.scale
         self._mask_topic = topic_table.MASK.of(self.robot)
@@ -110,7 +112,7 @@ class RgbdLog:
                 f"{self.path}: {self._color_topic} has {len(self._color_at)} images and {self._source.topic} "
                 f"{len(self._depth_at)}, none of them {near}, expected pairs"
             )
-        self._mask_at = self._read_mask_times()
+        self._mask_at = mask_entries(self._log, self.robot)
 
     def _read_camera(self) -> tuple[PinholeCamera, Lens | None]:
         topic = topic_table.CALIBRATION.of(self.robot)
@@ -126,40 +128,6 @@ class RgbdLog:
                 f"{self.path}: {topic} begins at {first} ns, expected no later than the images ({image} ns)"
             )
         return camera, lens
-
-    def _read_valid(self) -> NDArray[np.bool_] | None:
-        """Pixels that show the scene in all images, by all messages about it; None: all pixels.
-
-        Raises:
-            DuagError: a mask has another size than the images, or no pixel is left.
-        """
-        topic = topic_table.VALID.of(self.robot)
-        found = np.ones((self.camera.height, self.camera.width), dtype=bool)
-        for entry in self._log.entries(topic):
-            record = self._log.record_at(topic, entry)
-            where = f"{self.path}: {topic} at {record.publish_time_ns} ns"
-            valid = messages.unpack_valid(record.proto(), where)
-            check_size(record, valid.shape[1], valid.shape[0], self.camera)
-            found &= valid
-            if not found.any():
-                raise DuagError(f"{where} leaves no pixel that shows the scene, expected some")
-        return None if found.all() else found
-
-    def _read_mask_times(self) -> dict[int, tuple[int, int, int]]:
-        """The entry of every mask by its publish time.
-
-        Raises:
-            DuagError: a mask is of no color image.
-        """
-        at = self._log.entries_by_time(self._mask_topic)
-        if at:
-            stray = sorted(at.keys() - self._log.entries_by_time(self._color_topic).keys())
-            if stray:
-                raise DuagError(
-                    f"{self.path}: {self._mask_topic} has a mask at {stray[0]} ns, "
-                    f"expected one in {self._color_topic} at the same time"
-                )
-        return at
 
     def check_robot(self, robot: str) -> None:
         """Refuse the log of another robot.
@@ -228,7 +196,7 @@ class RgbdLog:
             parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
         """
         if self.needs_motion:
-            self._motion = DepthMotion(*parts)
+            self._motion = self.motion_along(*parts)
 
     def open_shutter(self, shutter_s: float, *parts: Trajectory) -> None:
         """Say how the camera moves while its shutter is open, in all frames read from now on.
@@ -237,7 +205,7 @@ class RgbdLog:
             shutter_s: how long it is open; 0: images are sharp.
             parts: as of `move_depth`.
         """
-        self.shutter = OpenShutter(shutter_s, DepthMotion(*parts)) if shutter_s > 0 else None
+        self.shutter = OpenShutter(shutter_s, self.motion_along(*parts)) if shutter_s > 0 else None
 
     def move_depth_by(self, frontend: Path, path: Trajectory | None = None) -> None:
         """`delay_depth`, `readout`, `move_depth` and `open_shutter` by what the front end found.
@@ -257,6 +225,18 @@ class RgbdLog:
     def motion_prior(self) -> MotionPrior | None:
         """How the camera moved by other sensors of the log; None if it has none."""
         return motion_prior(self._log, self.robot)
+
+    @cached_property
+    def _gyro(self) -> GyroPrior | None:
+        return gyro_prior(self._log, self.robot)
+
+    def motion_along(self, *parts: Trajectory) -> DepthMotion:
+        """The motion around every frame, by the poses of frames and the gyroscope if the log has one.
+
+        Args:
+            parts: as of `move_depth`.
+        """
+        return DepthMotion(*parts, gyro=self._gyro)
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Every frame in order of time."""

@@ -67,7 +67,7 @@ def found_s(
         color = np.rint(255 * np.clip(seen.color, 0, 1)).astype(np.uint8)
         return PosedRgbd(color, depth_m, T_map_camera)
 
-    log = SimpleNamespace(stated_shutter_s=stated_s, camera=CAMERA)
+    log = SimpleNamespace(stated_shutter_s=stated_s, camera=CAMERA, motion_along=DepthMotion)
     frames = [SimpleNamespace(frame_index=i, stamp_ns=int(s)) for i, s in enumerate(path.stamps_ns)]
     noise = np.random.default_rng(1).normal(scale=error, size=wall.colors.shape)
     grown = wall.replace(colors=(wall.colors + noise).astype(np.float32))

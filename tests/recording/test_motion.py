@@ -9,6 +9,8 @@ from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import LogWriter, open_rgbd
+from duagc.pipeline.recording.gyro_calibration import GyroCorrection
+from duagc.pipeline.recording.motion import GyroPrior
 from tests.fixtures.recording_logs import copy_camera, write_camera
 
 
@@ -65,5 +67,14 @@ def test_gyro_prior_turns_as_the_camera_does(tmp_path: Path) -> None:
     turned = np.array([0.5, -1.0, 0.2]) * (0.309 + 0.5 * (0.411**2 - 0.102**2))  # the axis is constant
     np.testing.assert_allclose(motion.T_start_stop, se3.exp([0, 0, 0, *turned]), atol=1e-4)
     assert prior.between(102_000_000, 700_000_000) is None
+    assert isinstance(prior, GyroPrior)
+    turns = prior.turns(411_000_000, np.array([102_000_000, 411_000_000, 500_000_000]), GyroCorrection())
+    assert turns is not None
+    np.testing.assert_allclose(turns[0].T, motion.T_start_stop[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(turns[1], np.eye(3), atol=1e-12)
+    later = prior.between(411_000_000, 500_000_000)
+    assert later is not None
+    np.testing.assert_allclose(turns[2], later.T_start_stop[:3, :3], atol=1e-12)
+    assert prior.turns(411_000_000, np.array([700_000_000]), GyroCorrection()) is None
     with pytest.raises(DuagError, match="/alpha/imu/transform has no message"):
         open_rgbd(write(False)).motion_prior()

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from duagc.converters.writer import RecordingWriter
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.recording.depth_sources import DepthImage
+from duagc.pipeline.recording.motion import GyroPrior
 from duagc.pipeline.recording.moved_depth import DepthMotion, move_depth
 from tests.fixtures.box_room import look, render
 
@@ -131,6 +132,38 @@ def test_a_camera_that_shakes_is_followed() -> None:
         off.append(se3.distance(found, true)[1])
         turns.append(se3.distance(np.eye(4), true)[1])
     assert np.mean(off) < 0.2 * np.mean(turns)
+
+
+def vibrating(seconds: float) -> np.ndarray:
+    """A camera on a machine that turns twelve times a second."""
+    angle = 0.04 * np.sin(24 * np.pi * seconds)
+    return place(seconds) @ se3.exp(np.array([0, 0, 0, angle, 0.5 * angle, 0]))
+
+
+def gyro_of_vibrations(late_s: float) -> GyroPrior:
+    """At 200 Hz, with a bias, mounted a degree askew, and a clock that may be late."""
+    times = np.arange(-0.1, 2.2, 0.005)
+    before, after = (np.array([vibrating(t - late_s + dt) for t in times]) for dt in (-1e-4, 1e-4))
+    rates = se3.log(se3.inverse(before) @ after)[:, 3:] / 2e-4
+    own = rates @ so3.exp([0.01, -0.015, 0.01]) + np.array([0.02, -0.01, 0.015])
+    return GyroPrior(np.rint(1e9 * times).astype(np.int64).tolist(), own)
+
+
+@pytest.mark.parametrize("late_s", [None, 0.0, 0.02])
+def test_vibrations_between_frames_are_known_by_a_gyroscope_alone(late_s: float | None) -> None:
+    stamps = np.arange(60, dtype=np.int64) * 33_333_333
+    part = Trajectory(stamps, np.array([vibrating(1e-9 * s) for s in stamps.tolist()]))
+    gyro = None if late_s is None else gyro_of_vibrations(late_s)
+    motion = DepthMotion(part, gyro=gyro)
+    for stamp in stamps[5:-5].tolist():
+        times = stamp + np.array([-10_000_000, 0, 7_000_000])
+        found = motion.at(stamp, times)
+        if late_s == 0.0:
+            assert found is not None
+            then = np.array([vibrating(1e-9 * t) for t in times.tolist()])
+            assert se3.distance(found, se3.inverse(vibrating(1e-9 * stamp)) @ then)[1].max() < 2e-3
+        else:
+            assert found is None, "neither poses nor another clock tell it"
 
 
 def test_poses_that_do_not_say_move_nothing() -> None:

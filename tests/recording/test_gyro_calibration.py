@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
-from duagc.pipeline.frontend.gyro_calibration import FEWEST, GyroCorrection, Turn
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.recording import Motion
+from duagc.pipeline.recording.gyro_calibration import FEWEST, GyroCorrection, Turn
 from tests.fixtures.room import CAMERA, pose, render
 
 STATED = 0.02  # rad/s
