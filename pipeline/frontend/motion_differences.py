@@ -113,7 +113,7 @@ class MovingView:
 
 
 def view_pairs(
-    log: RgbdLog, parts: Sequence[Trajectory], count: int
+    log: RgbdLog, parts: Sequence[Trajectory], count: int, quantile: float = 1.0
 ) -> Iterator[tuple[MovingView, MovingView]]:
     """Pairs of frames spread over a log, in order of time, between which the velocity changes most.
 
@@ -121,13 +121,14 @@ def view_pairs(
         log: of the robot.
         parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
         count: about how many.
+        quantile: of the changes to the views near one, in that to which it is paired: 1: the largest.
     """
     views = [_views(log, part) for part in parts]
     total = max(sum(len(part) for part in views), 1)
     for part in views:
         share = min(-(-count * len(part) // total), len(part))
         for first in (part[k] for k in evenly_spaced(len(part), share)):
-            second = _changed(first, part, log.camera.fx, MOST_OF_VIEW * log.camera.width)
+            second = _changed(first, part, log.camera.fx, MOST_OF_VIEW * log.camera.width, quantile=quantile)
             if second is not None:
                 yield first, second
 
@@ -196,7 +197,7 @@ def _views(log: RgbdLog, part: Trajectory) -> list[MovingView]:
 
 
 def _changed(
-    first: MovingView, views: Sequence[MovingView], focal_px: float, reach_px: float
+    first: MovingView, views: Sequence[MovingView], focal_px: float, reach_px: float, *, quantile: float
 ) -> MovingView | None:
     """The view next to one, in time and place, in which the camera moves most differently; None if there is none."""
     near = [v for v in views if v is not first and abs(v.stamp_ns - first.stamp_ns) <= FARTHEST_NS]
@@ -207,7 +208,8 @@ def _changed(
     velocities = np.array([view.velocity for view in near])
     changed = np.linalg.norm(px * change(T, first.velocity, velocities), axis=1)
     reached = (changed > 0) & (np.linalg.norm(px * se3.log(T), axis=1) <= reach_px)
-    return near[int(np.argmax(np.where(reached, changed, 0.0)))] if reached.any() else None
+    ranked = np.flatnonzero(reached)[np.argsort(-changed[reached], kind="stable")]
+    return near[int(ranked[round((1 - quantile) * (len(ranked) - 1))])] if len(ranked) else None
 
 
 def _solve(found: Sequence[MotionDifference], config: MotionTimeConfig) -> tuple[float, float]:

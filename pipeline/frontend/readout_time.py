@@ -53,6 +53,11 @@ ORIENTATIONS = (False, True)  # whether by columns
 STEP_PX = 8  # between the pixels by which the rows of a half are averaged
 SHORT_PERCENTILE = 10  # of the times between images
 MOVED_FRAMES = 20  # by which it is known how far rows move
+MOST_ROUNDS = 4
+SETTLED = 0.25  # of the readout, at most, found in the last round
+TYPICAL = (
+    0.5  # quantile of the changes of the velocity, where too few pairs with the largest can be registered
+)
 LEAST_POINTS = 50  # of a half that both frames see
 
 
@@ -99,11 +104,17 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
     for by_columns in ORIENTATIONS:
         found = Readout(by_columns=by_columns)
         left = left_of(found)
+        if left[0] is None:  # halves of images that are sheared too much cannot be registered
+            pairs = list(view_pairs(log, parts, config.pairs, TYPICAL))
+            left = left_of(found)
         certain = _certain(left, config)
         if any(certain):
             first = found = _added(found, left, certain, longest_s)
-            for _ in range(rounds - 1):
-                found = _added(found, left_of(found), certain, longest_s)
+            for done in range(2, (MOST_ROUNDS if rounds > 1 else 1) + 1):
+                before, found = found, _added(found, left_of(found), certain, longest_s)
+                added_s = found.color_s - before.color_s
+                if done >= rounds and added_s * first.color_s <= SETTLED * found.color_s * first.color_s:
+                    break
             if min(first.color_s * found.color_s, first.depth_s * found.depth_s) < 0:
                 return Readout()  # what contradicts itself was chance
             return found if _moved(log, found, parts) >= config.least_move else Readout()

@@ -11,7 +11,7 @@ from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.config.motion_times import ReadoutConfig
 from duagc.pipeline.frontend import readout_time
-from duagc.pipeline.frontend.motion_differences import FoundTime
+from duagc.pipeline.frontend.motion_differences import FoundTime, MovingView
 from duagc.pipeline.frontend.readout_time import certain_readout
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -142,6 +142,25 @@ def test_a_readout_that_its_second_round_reverses_is_none(
     readout = found(logs["none"], config)
     assert readout.rolls == rolls
     assert not rolls or readout.color_s == pytest.approx(0.020 + left_s)
+
+
+def test_halves_that_move_too_differently_give_way_to_others(
+    logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a machine that vibrates; and it is looked for again while much is left."""
+    rounds = iter([[None, None], *([FoundTime(1e-3 * left_ms, 1e-3), None] for left_ms in (10, 8, 3))])
+    seen: list[list[tuple[int, int]]] = []
+
+    def estimated(
+        _: object, pairs: list[tuple[MovingView, MovingView]], *__: object, **___: object
+    ) -> object:
+        seen.append([(first.index, second.index) for first, second in pairs])
+        return next(rounds)
+
+    monkeypatch.setattr(readout_time, "_estimated", estimated)
+    config = CONFIG.model_copy(update={"move_to_track_again": CONFIG.least_move})
+    assert found(logs["none"], config).color_s == pytest.approx(0.021)
+    assert seen[0] != seen[1] == seen[2] == seen[3]
 
 
 def parts_of(path: Path, out: Path, config: FrontendConfig) -> set[str]:
