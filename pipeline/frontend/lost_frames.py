@@ -21,6 +21,7 @@ from duagc.pipeline.frontend.current_frame import features_of
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
 from duagc.pipeline.frontend.judgment import contradicts
 from duagc.pipeline.frontend.stable_registration import register_until_stable
+from duagc.pipeline.frontend.submaps import lost
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, RgbdPyramid
@@ -43,6 +44,41 @@ LOOKED_FOR = frozenset(
     }
 )
 """Reasons of a loss that do not lie in the images: both can be used, and may show what a keyframe shows."""
+
+
+def without_jumps(
+    frames: Sequence[TrackedFrame],
+    keyframes: Sequence[TrackedKeyframe],
+    T_map_keyframes: Array,
+    config: FrontendConfig,
+) -> list[TrackedFrame]:
+    """The frames, lost where a camera of finite speed cannot have come from the one before, nor gone to the next.
+
+    Such a frame was registered to a wrong minimum, if these two are within reach of each other. Keyframes are judged
+    otherwise.
+
+    Args:
+        frames: every frame of the log, anchored to keyframes.
+        keyframes: of the map.
+        T_map_keyframes: [k, 4, 4], optimized.
+        config: of the front end.
+    """
+
+    def reaches(one: TrackedFrame, other: TrackedFrame) -> bool:
+        T, seen_m = T_map_keyframes[one.keyframe_index], keyframes[one.keyframe_index].median_depth_m
+        return _within_reach(
+            one, T @ one.T_keyframe_camera, other, T_map_keyframes, seen_m=seen_m, config=config
+        )
+
+    posed = [k for k, frame in enumerate(frames) if frame.status is not Status.LOST]
+    out, made = list(frames), {keyframe.frame_index for keyframe in keyframes}
+    for before, k, after in zip(posed, posed[1:], posed[2:], strict=False):
+        frame, around = frames[k], (frames[before], frames[after])
+        if frame.frame_index in made or any(reaches(frame, other) for other in around):
+            continue
+        if reaches(*around):
+            out[k] = lost(frame, Reason.JUMP)
+    return out
 
 
 def found_afterwards(

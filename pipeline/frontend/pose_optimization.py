@@ -20,7 +20,7 @@ from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.judgment import Judgment, judge
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pose_graph
 from duagc.pipeline.frontend.loop_outliers import consistent_loops
-from duagc.pipeline.frontend.lost_frames import found_afterwards
+from duagc.pipeline.frontend.lost_frames import found_afterwards, without_jumps
 from duagc.pipeline.frontend.rejected_parts import RejectedPart
 from duagc.pipeline.frontend.repeated_frames import without_stuck
 from duagc.pipeline.frontend.submaps import lost
@@ -84,7 +84,7 @@ class PathOptimization:
         path = self._consistent_path(keyframes, frames, pairs)
         T_map_keyframes = path.solution.T_map_keyframe
         found = found_afterwards(
-            path.frames,
+            without_jumps(path.frames, path.keyframes, T_map_keyframes, self.config),
             path.keyframes,
             T_map_keyframes,
             self.images,

@@ -8,7 +8,7 @@ import numpy as np
 
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.lost_frames import found_afterwards
+from duagc.pipeline.frontend.lost_frames import found_afterwards, without_jumps
 from duagc.pipeline.frontend.submaps import lost
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
@@ -52,6 +52,22 @@ def test_a_lost_frame_is_found_between_its_neighbors(run: Undisturbed) -> None:
     moved_m, turned_rad = se3.distance(T_map_keyframe @ found[LOST].T_keyframe_camera, run.poses[LOST])
     assert moved_m < 0.003
     assert turned_rad < 0.002
+
+
+def test_a_frame_that_jumps_away_and_back_is_lost(run: Undisturbed) -> None:
+    keyframes = run.tracker(END).keyframes
+    T = np.array([keyframe.T_map_keyframe for keyframe in keyframes])
+    frames = list(run.frames[:END])
+    assert without_jumps(frames, keyframes, T, CONFIG) == frames
+    away = np.eye(4)
+    away[0, 3] = 0.25  # within 33 ms
+    frames[LOST] = replace(frames[LOST], T_keyframe_camera=frames[LOST].T_keyframe_camera @ away)
+    jumped = without_jumps(frames, keyframes, T, CONFIG)
+    assert [k for k, (a, b) in enumerate(zip(jumped, frames, strict=True)) if a is not b] == [LOST]
+    assert (jumped[LOST].status, jumped[LOST].reason) == (Status.LOST, Reason.JUMP)
+    for k in range(LOST + 1, END):  # a camera that is carried off does not come back
+        frames[k] = replace(frames[k], T_keyframe_camera=frames[k].T_keyframe_camera @ away)
+    assert without_jumps(frames, keyframes, T, CONFIG) == frames
 
 
 def test_what_cannot_be_between_its_neighbors_stays_lost(run: Undisturbed) -> None:
