@@ -14,6 +14,7 @@ move far, the path that was tracked in rolling images bends with them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -55,9 +56,7 @@ SHORT_PERCENTILE = 10  # of the times between images
 MOVED_FRAMES = 20  # by which it is known how far rows move
 MOST_ROUNDS = 4
 SETTLED = 0.25  # of the readout, at most, found in the last round
-TYPICAL = (
-    0.5  # quantile of the changes of the velocity, where too few pairs with the largest can be registered
-)
+TYPICAL = 0.5  # quantile of the changes of velocity, where those of the largest cannot be registered
 LEAST_POINTS = 50  # of a half that both frames see
 
 
@@ -112,8 +111,9 @@ def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutCo
             first = found = _added(found, left, certain, longest_s)
             for done in range(2, (MOST_ROUNDS if rounds > 1 else 1) + 1):
                 before, found = found, _added(found, left_of(found), certain, longest_s)
-                added_s = found.color_s - before.color_s
-                if done >= rounds and added_s * first.color_s <= SETTLED * found.color_s * first.color_s:
+                in_first = math.copysign(1.0, first.color_s)  # the direction of the first round
+                grown_s = in_first * (found.color_s - before.color_s)
+                if done >= rounds and grown_s <= SETTLED * in_first * found.color_s:
                     break
             if min(first.color_s * found.color_s, first.depth_s * found.depth_s) < 0:
                 return Readout()  # what contradicts itself was chance

@@ -30,9 +30,7 @@ REACH_NS = 250_000_000  # from a frame to those by which its motion is known
 FRAMES_AROUND = 3  # of these, before and after it
 DEGREE, DEGREE_OF_SHAKES = 2, 4  # of the curve through their poses
 COMPARED_FRAMES = 100  # of a part, by which the degree is chosen
-MOST_OFF = (
-    0.5  # of the motion from one frame to the next: poses that are farther from their curves do not tell it
-)
+MOST_OFF = 0.5  # of a step between frames: poses that are farther from their curves do not predict motion
 SHAKES_FROM = 2.0  # times the errors of the higher degree, of a parabola: most of these are motion then
 
 
