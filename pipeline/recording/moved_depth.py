@@ -30,7 +30,6 @@ REACH_NS = 250_000_000  # from a frame to those by which its motion is known
 FRAMES_AROUND = 3  # of these, before and after it
 DEGREE, DEGREE_OF_SHAKES = 2, 4  # of the curve through their poses
 COMPARED_FRAMES = 100  # of a part, by which the degree is chosen
-MOST_OFF = 0.5  # of a step between frames: poses that are farther from their curves do not predict motion
 SHAKES_FROM = 2.0  # times the errors of the higher degree, of a parabola: most of these are motion then
 
 
@@ -41,12 +40,10 @@ class _CurveKind:
     Attributes:
         degree: of the curves.
         gyro: correction of the gyroscope that gives the rotations; None: the curves do.
-        predicts: whether these tell how the camera moved between its frames.
     """
 
     degree: int = DEGREE
     gyro: GyroCorrection | None = None
-    predicts: bool = True
 
 
 class DepthMotion:
@@ -115,7 +112,7 @@ class DepthMotion:
                 if number not in self._kinds:
                     self._kinds[number] = _kind_of(part, self._gyro)
                 kind = self._kinds[number]
-                curve = _curve_in(part, at, kind.degree) if kind.predicts else None
+                curve = _curve_in(part, at, kind.degree)
                 return None if curve is None else (kind, curve)
         return None
 
@@ -155,11 +152,9 @@ def _kind_of(part: Trajectory, gyro: GyroPrior | None) -> _CurveKind:
     """Of what kind curves are, by how far poses are from curves through those around them."""
     some = [int(k) for k in evenly_spaced(len(part), min(COMPARED_FRAMES, len(part)))]
     off: dict[int, list[Array]] = {DEGREE: [], DEGREE_OF_SHAKES: []}
-    steps = []
     for at in some:
         chosen = _around(part, at)
         if len(chosen) == 2 * FRAMES_AROUND + 1 and chosen[FRAMES_AROUND] == at:
-            steps.append(se3.log(se3.inverse(part.poses[at]) @ part.poses[at + 1]))
             for degree, of_degree in off.items():
                 of_degree.append(_fitted(part, at, chosen[chosen != at], degree)[-1])
     if not off[DEGREE]:
@@ -168,8 +163,7 @@ def _kind_of(part: Trajectory, gyro: GyroPrior | None) -> _CurveKind:
     correction, off_rad = (None, np.inf) if gyro is None else _compared(part, gyro, some)
     if off_rad < np.median(np.linalg.norm(np.array(off[degree])[:, 3:], axis=1)):
         return _CurveKind(_degree_by(off, slice(3)), correction)
-    off_step, step = (float(np.linalg.norm(tangents, axis=1).mean()) for tangents in (off[degree], steps))
-    return _CurveKind(degree, predicts=off_step <= MOST_OFF * step)
+    return _CurveKind(degree)
 
 
 def _degree_by(off: Mapping[int, Sequence[Array]], of_tangents: slice) -> int:
