@@ -123,27 +123,25 @@ def judge(
         found = judge_motion(
             views[first].features, views[second].features, T_first_second, config=limits, rng=rng
         )
+        contradicted = found is not None and contradicts(found, limits)
+        if found is not None and contradicted and found.with_given >= limits.min_inliers:
+            pyramid = images(second, len(views[first].reference.levels))
+            registration = config.tracking.registration
+            if not _images_support(found, views[first], pyramid, registration, T_given=T_first_second):
+                found = None
         if found is None:
             verdicts[ends] = _by_depth(views[first].coarsest, views[second].coarsest, T_first_second, config)
-        elif not contradicts(found, limits):
-            verdicts[ends] = PairVerdict.CONFIRMED
-        elif found.with_given >= limits.min_inliers and not _images_support(
-            found.T_first_second,
-            views[first],
-            images(second, len(views[first].reference.levels)),
-            config.tracking.registration,
-            T_given=T_first_second,
-        ):
-            verdicts[ends] = _by_depth(views[first].coarsest, views[second].coarsest, T_first_second, config)
-        else:
+        elif contradicted:
             verdicts[ends] = PairVerdict.FEATURES
             by_features.append(RelativePose(first, second, found.T_first_second, found.information))
+        else:
+            verdicts[ends] = PairVerdict.CONFIRMED
         checkpoints.at(part, count, len(pairs), lambda: (verdicts, by_features))
     parts = _parts(len(views), verdicts)
     sizes = {part: parts.count(part) for part in set(parts)}
     main = max(sizes, key=lambda part: (sizes[part], -part))
-    contradicted = {k: _reason(k, verdicts) for k, part in enumerate(parts) if part != main}
-    return Judgment(verdicts, parts, by_features, contradicted)
+    rejected = {k: _reason(k, verdicts) for k, part in enumerate(parts) if part != main}
+    return Judgment(verdicts, parts, by_features, rejected)
 
 
 def _judged(count: int, factors: Sequence[RelativePose], config: JudgmentConfig) -> list[Ends]:
@@ -176,17 +174,22 @@ def contradicts(found: FeatureJudgment, limits: JudgmentConfig) -> bool:
 
 
 def _images_support(
-    T_features: Array, view: KeyframeView, pyramid: RgbdPyramid, config: RegistrationConfig, *, T_given: Array
+    found: FeatureJudgment,
+    view: KeyframeView,
+    pyramid: RgbdPyramid,
+    config: RegistrationConfig,
+    *,
+    T_given: Array,
 ) -> bool:
-    """Whether a registration from the motion [4, 4] that features agree on ends nearer to it than to the given one."""
-    result = register(view.reference, pyramid, T_features, config)
+    """Whether a registration from the motion that features agree on ends nearer to it than to the given one, [4, 4]."""
+    result = register(view.reference, pyramid, found.T_first_second, config)
     depth_m = float(np.median(view.features.points[:, 2]))
 
     def away_rad(T: Array) -> float:
         moved_m, turned_rad = se3.distance(result.T_reference_target, T)
         return float(moved_m / depth_m + turned_rad)
 
-    return result.ok and away_rad(T_features) < away_rad(T_given)
+    return result.ok and away_rad(found.T_first_second) < away_rad(T_given)
 
 
 def _by_depth(first: Level, second: Level, T_first_second: Array, config: FrontendConfig) -> PairVerdict:
