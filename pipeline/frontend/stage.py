@@ -329,7 +329,8 @@ class _ComponentStage:
                     config=self.config,
                 ),
             )
-            log.move_depth(tracked_path(frames, solution.T_map_keyframe))
+        tracked = tracked_path(frames, solution.T_map_keyframe)
+        log.move_depth(tracked, kind=(kind := log.curve_kind(tracked)))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
         part = f"{self.name}.exposures"
         estimation = ExposureEstimation(self.blocks.of, self.config.exposure, save, part)
@@ -358,6 +359,8 @@ class _ComponentStage:
             notes |= log.readout.notes()
         if built.shutter_s > 0:
             notes[FOUND_KEY] = repr(built.shutter_s)
+        if log.needs_motion or built.shutter_s > 0:
+            notes |= kind.notes()
         odometry = [odometry_message(self.name, frame, refined.T_map_keyframe) for frame in built.frames]
         write_log(
             out_path,

@@ -18,10 +18,11 @@ from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.geometry.open_shutter import OpenShutter
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.color_images import ColorImages
+from duagc.pipeline.recording.depth_motion import CurveKind, DepthMotion
 from duagc.pipeline.recording.depth_sources import DepthImage, Lidar, check_size, constant, depth_source
 from duagc.pipeline.recording.mask_topics import mask_entries, valid_pixels
 from duagc.pipeline.recording.motion import GyroPrior, MotionPrior, gyro_prior, motion_prior
-from duagc.pipeline.recording.moved_depth import DepthMotion, depth_delay_ns, move_depth, tracked_frames
+from duagc.pipeline.recording.moved_depth import depth_delay_ns, move_depth, tracked_frames
 from duagc.pipeline.recording.pairing import pair, pair_topics
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile
 from duagc.pipeline.recording.rgbd_frame import RgbdFrame
@@ -105,6 +106,7 @@ class RgbdLog:
         self.readout = self._stated_readout or Readout()
         self.stated_shutter_s = stated_shutter_s(written, str(self.path))
         self._motion: DepthMotion | None = None
+        self._kind: CurveKind | None = None
         self.shutter: OpenShutter | None = None
         if not len(self.pairing.offsets_ns):
             near = f"within {self.pairing.tolerance_ns / 1e6:g} ms of each other"
@@ -189,12 +191,14 @@ class RgbdLog:
         """Whether some depth, or some row, is of another time than its color."""
         return bool(self.pairing.largest_offset_ns) or self.readout.rolls
 
-    def move_depth(self, *parts: Trajectory) -> None:
+    def move_depth(self, *parts: Trajectory, kind: CurveKind | None = None) -> None:
         """Move depth and rows of another time than their color's into that time, in all frames read from now on.
 
         Args:
             parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
+            kind: of the curves that describe all motion from now on; None: by the poses of each part.
         """
+        self._kind = kind
         if self.needs_motion:
             self._motion = self.motion_along(*parts)
 
@@ -219,7 +223,7 @@ class RgbdLog:
         shutter_s = found_shutter_s(frontend)
         if self.needs_motion or shutter_s > 0:
             path = tracked_frames(frontend) if path is None else path
-            self.move_depth(path)
+            self.move_depth(path, kind=CurveKind.found(frontend))
             self.open_shutter(shutter_s, path)
 
     def motion_prior(self) -> MotionPrior | None:
@@ -236,7 +240,15 @@ class RgbdLog:
         Args:
             parts: as of `move_depth`.
         """
-        return DepthMotion(*parts, gyro=self._gyro)
+        return DepthMotion(*parts, gyro=self._gyro, kind=self._kind)
+
+    def curve_kind(self, part: Trajectory) -> CurveKind:
+        """The kind of curves that describes the motion along a path best.
+
+        Args:
+            part: T_map_camera of its frames.
+        """
+        return CurveKind.of(part, self._gyro)
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Every frame in order of time."""

@@ -21,8 +21,8 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.depth_motion import DepthMotion
 from duagc.pipeline.recording.depth_sources import DepthImage
-from duagc.pipeline.recording.moved_depth import DepthMotion
 from duagc.pipeline.recording.read import log_metadata
 
 Image = NDArray[np.float32]

@@ -16,7 +16,7 @@ from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.kernels.moving_views import draw_moving
 from duagc.pipeline.recording import LogWriter
-from duagc.pipeline.recording.moved_depth import DepthMotion
+from duagc.pipeline.recording.depth_motion import DepthMotion
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.pipeline.splat.gaussians import Gaussians
 from tests.frontend.test_mapping import CAMERA, POSES, QUICK, build, same, shot

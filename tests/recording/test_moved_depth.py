@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.recording.depth_motion import KIND_KEY, CurveKind, DepthMotion
 from duagc.pipeline.recording.depth_sources import DepthImage
 from duagc.pipeline.recording.motion import GyroPrior
-from duagc.pipeline.recording.moved_depth import DepthMotion, move_depth
+from duagc.pipeline.recording.moved_depth import move_depth
+from duagc.pipeline.recording.write import LogWriter
 from tests.fixtures.box_room import look, render
 
 CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -163,6 +166,34 @@ def test_vibrations_between_frames_are_known_by_a_gyroscope_alone(late_s: float)
             assert se3.distance(found, se3.inverse(vibrating(1e-9 * stamp)) @ then)[1].max() < 2e-3
         else:
             np.testing.assert_array_equal(found, without, "another clock says nothing")
+
+
+@pytest.mark.parametrize("shakes", [False, True])
+def test_the_kind_of_curves_is_read_as_it_was_written(tmp_path: Path, shakes: bool) -> None:
+    """What a front end found describes the motion along other poses of the same frames too."""
+    stamps = np.arange(60, dtype=np.int64) * 33_333_333
+    of = vibrating if shakes else place
+    part = Trajectory(stamps, np.array([of(1e-9 * s) for s in stamps.tolist()]))
+    gyro = gyro_of_vibrations(0.0) if shakes else None
+    kind = CurveKind.of(part, gyro)
+    assert bool(kind.notes()) == shakes, "parabolas go without saying"
+    with LogWriter(tmp_path / "a.mcap", "alpha", kind.notes()):
+        pass
+    found = CurveKind.found(tmp_path / "a.mcap")
+    still = Trajectory(stamps, part.poses[:1].repeat(len(stamps), axis=0))
+    given, again = (DepthMotion(still, gyro=gyro, kind=k) for k in (kind, found))
+    times = stamps[30] + np.array([-10_000_000, 7_000_000])
+    np.testing.assert_array_equal(given.at(stamps[30], times), again.at(stamps[30], times))
+
+
+@pytest.mark.parametrize(
+    "said", ["", "{}", '{"degree": 3, "gyro": null}', '{"degree": 4, "gyro": {"bias": [1]}}']
+)
+def test_kinds_of_curves_that_no_front_end_writes_are_refused(tmp_path: Path, said: str) -> None:
+    with LogWriter(tmp_path / "a.mcap", "alpha", {KIND_KEY: said}):
+        pass
+    with pytest.raises(DuagError, match=r"motion_curves is .*, expected degree and gyro"):
+        CurveKind.found(tmp_path / "a.mcap")
 
 
 def test_poses_that_do_not_say_move_nothing() -> None:
