@@ -32,13 +32,26 @@ def initial_motions(state: TrackingState, frame: CurrentFrame) -> Iterator[tuple
     Yields:
         Keyframe index and T_keyframe_camera [4, 4].
     """
-    config = state.config.tracking.relocalization
-    for k in [state.keyframe_index, *_other_keyframes(state, frame)]:
-        # the draws only choose which samples are tried: the same in every run
-        rng = random_streams.generator(0, "initialization", frame=frame.frame_index, keyframe=k)
-        found = motion_from_features(state.keyframes[k].features, frame.features, config, rng)
-        if found.T_first_second is not None and found.accepted:
-            yield k, found.T_first_second
+    if (latest := initial_motion(state, frame, state.keyframe_index)) is not None:
+        yield state.keyframe_index, latest
+    for k in _other_keyframes(state, frame):
+        if (motion := initial_motion(state, frame, k)) is not None:
+            yield k, motion
+
+
+def initial_motion(state: TrackingState, frame: CurrentFrame, keyframe_index: int) -> Array | None:
+    """T_keyframe_camera [4, 4] that matched features agree on; None: on none.
+
+    Args:
+        state: what the tracker knows.
+        frame: the current frame.
+        keyframe_index: of the keyframe.
+    """
+    # the draws only choose which samples are tried: the same in every run
+    rng = random_streams.generator(0, "initialization", frame=frame.frame_index, keyframe=keyframe_index)
+    features, config = state.keyframes[keyframe_index].features, state.config.tracking.relocalization
+    found = motion_from_features(features, frame.features, config, rng)
+    return found.T_first_second if found.accepted else None
 
 
 def _other_keyframes(state: TrackingState, frame: CurrentFrame) -> Iterator[int]:

@@ -10,7 +10,7 @@ import numpy as np
 from duagc.pipeline.config.frontend import TrackingConfig
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.feature_initialization import initial_motions
+from duagc.pipeline.frontend.feature_initialization import initial_motion, initial_motions
 from duagc.pipeline.frontend.pose_checks import (
     FOLLOWED,
     FOUND_BY_FEATURES,
@@ -71,12 +71,12 @@ def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCand
     A registration that went farther from the prediction than it converges from may have ended in a wrong minimum that
     looks as usual, too.
     """
-    usual = _looks_as_usual(state, found)
-    if usual and not _went_far(state, frame, found):
-        return found
-    for candidate in _from_features(state, frame, state.config.tracking):
-        if usual and candidate.keyframe_index != found.keyframe_index:
-            break
+    usual, only = _looks_as_usual(state, found), None
+    if usual:
+        if not went_far(state, frame, found):
+            return found
+        only = found.keyframe_index  # residuals tell which of the minima of one keyframe is deeper
+    for candidate in _from_features(state, frame, state.config.tracking, only=only):
         other = verify(FOUND_NEARBY, state, frame, candidate)
         if isinstance(other, PoseCandidate) and (
             (not usual and _looks_as_usual(state, other)) or _fits_better(state, other, found)
@@ -85,8 +85,14 @@ def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCand
     return found
 
 
-def _went_far(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> bool:
-    """Whether a view is, or may well be, farther from its prediction than dense registration converges from."""
+def went_far(state: TrackingState, frame: CurrentFrame, found: PoseCandidate) -> bool:
+    """Whether a view is, or may well be, farther from its prediction than dense registration converges from.
+
+    Args:
+        state: what the tracker knows.
+        frame: the current frame.
+        found: where it was found.
+    """
     if found.without is not Reason.NONE or state.lost:
         return False
     predicted = state.predict(frame.stamp_ns)
@@ -209,10 +215,15 @@ def _from_all_around(
 
 
 def _from_features(
-    state: TrackingState, frame: CurrentFrame, tracking: TrackingConfig
+    state: TrackingState, frame: CurrentFrame, tracking: TrackingConfig, *, only: int | None = None
 ) -> Iterator[PoseCandidate]:
-    """Registrations by some settings from the motions that features agree on."""
-    for index, guess in initial_motions(state, frame):
+    """Registrations by some settings from the motions that features agree on; to `only` one keyframe."""
+    if only is None:
+        motions = initial_motions(state, frame)
+    else:
+        motion = initial_motion(state, frame, only)
+        motions = iter(() if motion is None else ((only, motion),))
+    for index, guess in motions:
         result = register_until_stable(
             state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
         )

@@ -13,7 +13,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels, hidden_pixels
-from duagc.pipeline.frontend.nearby_registration import register_nearby
+from duagc.pipeline.frontend.nearby_registration import register_nearby, went_far
 from duagc.pipeline.frontend.pose_checks import FOLLOWED, verify
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
@@ -71,6 +71,8 @@ def _checked(
     most = state.config.tracking.failure.max_free_space_violations
     if hidden.share <= LITTLE * most:
         return replace(frame, suspected=hidden), whole
+    if hidden.share <= most and not went_far(state, frame, whole) and _stays(state, frame, whole, hidden):
+        return replace(frame, suspected=hidden), whole
     without = _register_without(state, frame, T_map_camera)
     usual = without is not None and _usual(state, without[1])
     if without is not None and usual and (_hides(without[0]) > most or _apart(state, whole, without[1])):
@@ -78,6 +80,18 @@ def _checked(
         return without
     found = _believed(state, whole) if hidden.share > most else whole
     return replace(frame, suspected=hidden), found
+
+
+def _stays(state: TrackingState, frame: CurrentFrame, whole: PoseCandidate, hidden: HiddenPixels) -> bool:
+    """Whether a frame is where it was found as a whole without what may hide it, too, and no more of it is hidden."""
+    reference = state.keyframes[whole.keyframe_index].reference
+    tracking, T_found = state.config.tracking, whole.result.T_reference_target
+    result = register(reference, frame.without(hidden).pyramid, T_found, tracking.registration)
+    without = replace(whole, result=result)
+    if not result.ok or _apart(state, whole, without):
+        return False
+    still = _hidden(state, frame, state.in_map(without))
+    return still.share <= tracking.failure.max_free_space_violations
 
 
 def _hides(frame: CurrentFrame) -> float:

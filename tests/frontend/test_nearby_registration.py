@@ -102,6 +102,11 @@ def test_a_frame_far_from_its_prediction_is_where_it_fits_best_though_it_looks_a
     aside = replace(predicted, T_keyframe_camera=predicted.T_keyframe_camera @ se3.exp(tangent))
     assert not state.weakly_predicted(aside)
     monkeypatch.setattr(state, "predict", lambda stamp_ns: aside)
+
+    def unexpected(*_: object) -> None:
+        raise AssertionError("residuals do not tell which of two keyframes is right")
+
+    monkeypatch.setattr(nearby_registration, "initial_motions", unexpected)
     off_by(0.02, 1.3, monkeypatch)
     found = distance_m(run, state, nearby_registration.register_nearby(state, frame))
     assert found == pytest.approx(off_m, abs=2e-3)

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from duagc.pipeline import registration
 from duagc.pipeline.experiments.disturbed_tracking import WRONG_M, Undisturbed
 from duagc.pipeline.experiments.shots import Shot
+from duagc.pipeline.frontend import occluded_frames
+from duagc.pipeline.frontend.current_frame import CurrentFrame
 from duagc.pipeline.frontend.frame_images import RgbdImages
-from duagc.pipeline.frontend.hidden_pixels import carried, hidden_pixels
+from duagc.pipeline.frontend.hidden_pixels import HiddenPixels, carried, hidden_pixels
+from duagc.pipeline.frontend.occluded_frames import LITTLE, register_visible
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
 from duagc.pipeline.frontend.tracked import Status
+from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration import Level
+from duagc.pipeline.registration import Level, Registration
 from tests.fixtures.films import CAMERA, FRAMES, filmed
-from tests.frontend.conftest import CONFIG
+from tests.frontend.conftest import CONFIG, STARTS
 
 ENTERS, PASSES = 20, 60  # frame at which it comes in; frames that it takes
 WIDTH = 0.3  # of the view
@@ -111,3 +117,42 @@ def test_an_object_is_carried_into_the_next_view_until_it_is_gone() -> None:
     mask = carried(before < 2, 1 / before, level(after), min_region=0.002)
     np.testing.assert_array_equal(mask, after < 2)
     assert not carried(before < 2, 1 / before, level(np.full((h, w), 3.0)), min_region=0.002).any()
+
+
+def thing(share: float) -> HiddenPixels:
+    """What may hide a share of the view, at its left border."""
+    mask = np.zeros((SHAPE[0] // 8, SHAPE[1] // 8), dtype=bool)
+    mask[:, : round(share * mask.shape[1])] = True
+    return HiddenPixels(mask, share, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("share", "moved_m", "again"), [(0.05, 0.0, False), (0.05, 0.03, True), (0.2, 0.0, True)]
+)
+def test_a_frame_is_registered_without_an_object_only_where_that_may_change_it(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch, share: float, moved_m: float, again: bool
+) -> None:
+    tracker, shot = run.tracker(STARTS[0]), run.shots[STARTS[0]]
+    image = shot.color.astype(np.float32) / 255
+    frame = tracker.prepared(
+        RgbdImages(frame_index=shot.index, stamp_ns=shot.stamp_ns, image=image, depth_m=shot.depth)
+    )
+    asked: list[CurrentFrame] = []
+
+    def without(state: TrackingState, frame: CurrentFrame, T_map_camera: np.ndarray) -> None:
+        asked.append(frame)
+
+    def register(*arguments: Any) -> Registration:
+        result = registration.register(*arguments)
+        T = result.T_reference_target @ se3.exp(np.array([moved_m, 0, 0, 0, 0, 0]))
+        return replace(result, T_reference_target=T)
+
+    limit = CONFIG.tracking.failure.max_free_space_violations
+    assert LITTLE * limit < 0.05 < limit < 0.2
+    monkeypatch.setattr(occluded_frames, "_hidden", lambda *_: thing(share))
+    monkeypatch.setattr(occluded_frames, "_register_without", without)
+    monkeypatch.setattr(occluded_frames, "register", register)
+    found, _ = register_visible(tracker.state, frame)
+    assert bool(asked) == again
+    assert found.suspected is not None
+    assert found.suspected.share == share
