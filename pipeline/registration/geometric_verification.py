@@ -7,8 +7,8 @@ differ in their settings and in what they have of the two views.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -66,6 +66,34 @@ class VerificationView:
 
 
 @dataclass(frozen=True)
+class MeasuredMotion:
+    """A registration of two views in one direction.
+
+    Attributes:
+        reference: samples of one view.
+        target: the other view.
+        result: as it ended.
+        T_first_second: [4, 4], by it.
+        information: [6, 6] of the right tangent of T_first_second.
+        shares_enough: whether the views share enough there.
+    """
+
+    reference: Reference
+    target: RgbdPyramid
+    result: Registration
+    T_first_second: Array
+    information: Array
+    shares_enough: bool
+
+    @property
+    def alike(self) -> float:
+        """Share of the texture that both see that looks alike there; 0 where registration failed."""
+        if not self.result.ok:
+            return 0.0
+        return share_alike(self.reference, self.target, self.result.T_reference_target)
+
+
+@dataclass(frozen=True)
 class GeometricVerification:
     """Result of `verify`.
 
@@ -79,7 +107,7 @@ class GeometricVerification:
             whichever is less; 0 before it.
         correction_rad: the same for the rotation.
         another: of the other motion, if features agree on two.
-        alike: share of the texture that both views see that looks alike; 1 before the registration.
+        measured: the registrations, in one direction or both.
     """
 
     failure: Failure | None
@@ -90,7 +118,12 @@ class GeometricVerification:
     correction_m: float = 0.0
     correction_rad: float = 0.0
     another: GeometricVerification | None = None
-    alike: float = 1.0
+    measured: Sequence[MeasuredMotion] = field(default=(), repr=False)
+
+    @property
+    def alike(self) -> float:
+        """Share of the texture that both views see that looks alike; 1 before the registration."""
+        return min((one.alike for one in self.measured), default=1.0)
 
     @property
     def of_place(self) -> GeometricVerification:
@@ -186,27 +219,8 @@ def _verified(
         information,
         correction_m=moved_m,
         correction_rad=moved_rad,
-        alike=min(one.alike for one in measured),
+        measured=measured,
     )
-
-
-@dataclass(frozen=True)
-class _Measured:
-    """A registration of two views in one direction.
-
-    Attributes:
-        result: as it ended.
-        T_first_second: [4, 4], by it.
-        information: [6, 6] of the right tangent of T_first_second.
-        shares_enough: whether the views share enough there.
-        alike: share of the texture that both see that looks alike there; 0 where registration failed.
-    """
-
-    result: Registration
-    T_first_second: Array
-    information: Array
-    shares_enough: bool
-    alike: float
 
 
 def _registered(
@@ -216,24 +230,22 @@ def _registered(
     *,
     config: GeometricVerificationConfig,
     registration: RegistrationConfig,
-) -> list[_Measured]:
+) -> list[MeasuredMotion]:
     """Registrations from a motion [4, 4], in the directions that are possible."""
     measured = []
     if first.reference is not None and second.images is not None:
         target = second.images()
         forward = register(first.reference, target, T_first_second, registration)
         enough = _shares_enough(forward, first.reference, target, config)
-        T = forward.T_reference_target
-        alike = share_alike(first.reference, target, T) if forward.ok else 0.0
-        measured.append(_Measured(forward, T, forward.information, enough, alike))
+        T, information = forward.T_reference_target, forward.information
+        measured.append(MeasuredMotion(first.reference, target, forward, T, information, enough))
     if second.reference is not None and first.images is not None:
         target = first.images()
         backward = register(second.reference, target, se3.inverse(T_first_second), registration)
         enough = _shares_enough(backward, second.reference, target, config)
-        T_second_first = backward.T_reference_target
-        information = se3.inverse_information(T_second_first, backward.information)
-        alike = share_alike(second.reference, target, T_second_first) if backward.ok else 0.0
-        measured.append(_Measured(backward, se3.inverse(T_second_first), information, enough, alike))
+        T = se3.inverse(backward.T_reference_target)
+        information = se3.inverse_information(backward.T_reference_target, backward.information)
+        measured.append(MeasuredMotion(second.reference, target, backward, T, information, enough))
     return measured
 
 
