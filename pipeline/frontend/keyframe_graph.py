@@ -114,13 +114,9 @@ def leaves_keyframe(
     """
     if overlap < config.min_overlap:
         return True
-    coarsest = pyramid.levels[-1].inverse_depth
-    known = coarsest[coarsest > 0]
-    median_depth_m = 1 / float(np.median(known)) if len(known) else np.inf
     moved_m, turned_rad = se3.distance(np.eye(4), T_keyframe_camera)
-    return bool(
-        moved_m > config.max_translation_of_depth * median_depth_m or turned_rad > config.max_rotation_rad
-    )
+    most_m = config.max_translation_of_depth * pyramid.levels[-1].median_depth_m
+    return bool(moved_m > most_m or turned_rad > config.max_rotation_rad)
 
 
 def predicted_overlap(reference: Reference, pyramid: RgbdPyramid, T_reference_target: Array) -> float:

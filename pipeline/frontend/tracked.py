@@ -124,11 +124,10 @@ class TrackedKeyframe:
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         return se3.transform(self.T_map_keyframe, middle[None])[0]
 
-    @cached_property
+    @property
     def median_depth_m(self) -> float:
         """Median depth of what it sees, meters; infinite if it sees nothing."""
-        known = self.coarsest.inverse_depth[self.coarsest.inverse_depth > 0]
-        return 1 / float(np.median(known)) if len(known) else np.inf
+        return self.coarsest.median_depth_m
 
 
 def tracked_path(frames: Sequence[TrackedFrame], T_map_keyframe: Array) -> Trajectory:

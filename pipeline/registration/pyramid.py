@@ -70,6 +70,12 @@ class Level:
         return back_project(self.camera, u, v, 1 / self.inverse_depth[v, u].astype(np.float64))
 
     @cached_property
+    def median_depth_m(self) -> float:
+        """Median depth of the pixels of known depth, meters; infinite if there is none."""
+        known = self.inverse_depth[self.inverse_depth > 0]
+        return 1 / float(np.median(known)) if len(known) else np.inf
+
+    @cached_property
     def nearest(self) -> Image:
         """Largest inverse depth [h, w] in the 3x3 pixels around every pixel, 1/m, 0 where none is known."""
         return largest_of_3x3(self.inverse_depth)
