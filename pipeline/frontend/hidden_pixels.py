@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.masks import Mask
+from duagc.pipeline.geometry.masks import Mask, large_regions
 from duagc.pipeline.geometry.projection import FREE, ON_SURFACE, SAME_SURFACE, free_space
 from duagc.pipeline.registration import Level
 
@@ -80,7 +80,7 @@ def hidden_pixels(
     )
     of_object = in_free_space > config.tracking.failure.max_free_space_violations * sizes
     of_object[0] = False
-    found = _large(of_object[labels] | is_free, config.moving.min_region)
+    found = large_regions(of_object[labels] | is_free, config.moving.min_region)
     mask = cv2.dilate(found.view(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     height, width = view.inverse_depth.shape
     whole = mask.repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
@@ -143,17 +143,7 @@ def carried(before: Mask, inverse_depth_before: Image, view: Level, *, min_regio
     followed = np.zeros(labels.max() + 1, bool)
     followed[labels[same]] = True
     followed[0] = False
-    return _large(followed[labels], min_region)
-
-
-def _large(found: Mask, min_region: float) -> Mask:
-    """The connected regions of at least a share of the image."""
-    import cv2
-
-    _, labels, statistics, _ = cv2.connectedComponentsWithStats(found.view(np.uint8), connectivity=8)
-    large = statistics[:, cv2.CC_STAT_AREA] >= min_region * found.size
-    large[0] = False
-    return np.asarray(large[labels])
+    return large_regions(followed[labels], min_region)
 
 
 def _surfaces(inverse_depth: Image, among: Mask) -> NDArray[np.int32]:

@@ -54,6 +54,21 @@ def whole_windows(mask: Mask, reach_px: int) -> Mask:
     return np.asarray(eroded, dtype=np.uint8).astype(bool)
 
 
+def large_regions(pixels: Mask, least_share: float) -> Mask:
+    """The connected regions, corners connect too, of at least a share of the image; [H, W].
+
+    Args:
+        pixels: bool [H, W], those that belong to some region.
+        least_share: of all pixels of the image.
+    """
+    import cv2
+
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(pixels.view(np.uint8), connectivity=8)
+    large = statistics[:, cv2.CC_STAT_AREA] >= least_share * pixels.size
+    large[0] = False  # the pixels of none
+    return np.asarray(large[labels])
+
+
 def distance_px(mask: Mask) -> NDArray[np.float32]:
     """Distance of every pixel to the nearest one that may not be used, px, [H, W]; 0 there.
 

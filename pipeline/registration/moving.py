@@ -18,6 +18,7 @@ from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.masks import large_regions
 from duagc.pipeline.geometry.projection import FREE, ON_SURFACE, back_project, free_space, largest_of_3x3
 from duagc.pipeline.registration.pyramid import Level
 
@@ -152,13 +153,10 @@ class FreeSpace:
         """Connected regions that are large enough, enlarged, at full size."""
         import cv2
 
-        _, labels, statistics, _ = cv2.connectedComponentsWithStats(found.view(np.uint8), connectivity=8)
-        large = statistics[:, cv2.CC_STAT_AREA] >= self.config.min_region * found.size
-        large[0] = False
         full, scale = np.zeros((self._camera.height, self._camera.width), bool), 2**self.config.halvings
-        if not large.any():
+        grown = large_regions(found, self.config.min_region)
+        if not grown.any():
             return full
-        grown = large[labels]
         if steps := self.config.grow_px // scale:
             grown = cv2.dilate(grown.view(np.uint8), np.ones((3, 3)), iterations=steps).astype(bool)
         whole = grown.repeat(scale, axis=0).repeat(scale, axis=1)

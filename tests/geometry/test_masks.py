@@ -102,3 +102,14 @@ def test_a_total_is_that_of_usable_pixels(seed: int, share: float) -> None:
     np.testing.assert_allclose(
         masks.total(planes[0], mask), planes[0][mask].sum(dtype=np.float64), rtol=1e-12
     )
+
+
+def test_regions_of_less_than_a_share_of_the_image_are_left_out() -> None:
+    pixels = np.zeros((10, 10), bool)
+    pixels[0, 0] = pixels[1, 1] = pixels[2, 2] = True  # connected by corners
+    pixels[7, 7] = True
+    found = masks.large_regions(pixels, 0.03)
+    assert found.sum() == 3
+    assert not found[7, 7]
+    assert not masks.large_regions(pixels, 0.04).any()
+    assert (masks.large_regions(pixels, 0.0) == pixels).all()
