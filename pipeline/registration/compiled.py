@@ -15,7 +15,7 @@ from duagc.pipeline.kernels import alignment
 from duagc.pipeline.registration.normal_equations import NormalEquations, SamplesSeen, System
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference, ReferenceLevel
-from duagc.pipeline.registration.residuals import GATE_SIGMAS, MAD_STRIDE
+from duagc.pipeline.registration.residuals import GATE_SIGMAS, MAD_FROM, MAD_STRIDE
 from duagc.pipeline.registration.search import (
     ALL_DIRECTIONS,
     STEP_TOLERANCE,
@@ -130,7 +130,7 @@ def _settings(reference: Reference, config: RegistrationConfig) -> alignment.Ali
         huber_sigmas=config.huber_sigmas,
         min_gradient=config.min_gradient,
         mad_stride=MAD_STRIDE,
-        mad_from=1000 * MAD_STRIDE,
+        mad_from=MAD_FROM,
     )
 
 

@@ -39,7 +39,8 @@ from duagc.pipeline.registration.reference import Reference, ReferenceLevel
 Floats = NDArray[np.floating]
 Index = NDArray[np.int64]
 
-MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
+MAD_STRIDE = 4  # residuals between those that estimate a scale
+MAD_FROM = 1000 * MAD_STRIDE  # residuals up to which all estimate it
 GATE_SIGMAS = 3  # of depth whose sigma is measured: the gate is no narrower
 
 
@@ -344,7 +345,7 @@ def _weighted(
     no less than the floor, and its own part is added to that for each residual.
     """
     magnitude = np.abs(residual)
-    part = magnitude[::MAD_STRIDE] if len(magnitude) > 1000 * MAD_STRIDE else magnitude
+    part = magnitude[::MAD_STRIDE] if len(magnitude) > MAD_FROM else magnitude
     scale = max(mad_sigma(part), floor) if len(residual) else floor
     if known_variance is None or not len(residual):
         weight = 1 / (huber_divisor(magnitude, np.float32(huber_sigmas * scale)) * np.float32(scale**2))
