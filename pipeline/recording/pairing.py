@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile
+from duagc.pipeline.recording.stated_times import stated_seconds
 
 TOLERANCE_NS = 100_000_000
 """Depth farther from a color image is not moved there: the camera may have turned back meanwhile."""
@@ -82,18 +81,9 @@ def pair_topics(log: LogFile, color: str, depth: str) -> Pairing:
 
 
 def _tolerance_ns(log: LogFile) -> int:
-    text = dict(log.metadata()).get(LOG_RECORD, {}).get(TOLERANCE_KEY)
-    if text is None:
-        return TOLERANCE_NS
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0 <= seconds <= TOLERANCE_NS / 1e9:
-        raise DuagError(
-            f"{log.path}: {TOLERANCE_KEY} is {text!r}, expected 0 to {TOLERANCE_NS / 1e9:g} seconds"
-        )
-    return round(seconds * 1e9)
+    metadata = dict(log.metadata()).get(LOG_RECORD, {})
+    seconds = stated_seconds(metadata, TOLERANCE_KEY, str(log.path), most_s=TOLERANCE_NS / 1e9)
+    return TOLERANCE_NS if seconds is None else round(seconds * 1e9)
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:

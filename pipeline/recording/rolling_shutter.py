@@ -8,7 +8,6 @@ row that saw its point. Where a log states nothing, the front end finds it (`fro
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -18,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording.depth_motion import DepthMotion
 from duagc.pipeline.recording.depth_sources import DepthImage
 from duagc.pipeline.recording.read import log_metadata
+from duagc.pipeline.recording.stated_times import stated_seconds
 
 Image = NDArray[np.float32]
 COLOR_READOUT_KEY, DEPTH_READOUT_KEY = "rolling_shutter_s", "depth_rolling_shutter_s"
@@ -102,19 +101,10 @@ def _parsed(metadata: Mapping[str, str], where: str, least_s: float) -> Readout 
     keys = COLOR_READOUT_KEY, DEPTH_READOUT_KEY
     if metadata.keys().isdisjoint(keys):
         return None
-    color_s, depth_s = (_seconds(metadata, key, where, least_s) for key in keys)
+    color_s, depth_s = (
+        stated_seconds(metadata, key, where, least_s=least_s, most_s=LONGEST_S) or 0.0 for key in keys
+    )
     return Readout(color_s, depth_s, metadata.get(LINES_KEY) == COLUMNS)
-
-
-def _seconds(metadata: Mapping[str, str], key: str, where: str, least_s: float) -> float:
-    text = metadata.get(key, "0")
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not least_s <= seconds <= LONGEST_S:
-        raise DuagError(f"{where}: {key} is {text!r}, expected {least_s:g} to {LONGEST_S:g} seconds")
-    return seconds
 
 
 @lru_cache(maxsize=4)

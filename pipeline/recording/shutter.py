@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording.read import log_metadata
+from duagc.pipeline.recording.stated_times import stated_seconds
 
 STATED_KEY = "exposure_s"
 """In the metadata of a robot's log: seconds, the stamp of an image in the middle of them."""
@@ -26,7 +25,7 @@ def stated_shutter_s(metadata: Mapping[str, str], where: str) -> float | None:
     Raises:
         DuagError: a time that no video camera takes.
     """
-    return _seconds(metadata, STATED_KEY, where)
+    return stated_seconds(metadata, STATED_KEY, where, most_s=LONGEST_S)
 
 
 def found_shutter_s(frontend: Path) -> float:
@@ -38,17 +37,4 @@ def found_shutter_s(frontend: Path) -> float:
     Raises:
         DuagError: a time that no video camera takes.
     """
-    return _seconds(log_metadata(frontend), FOUND_KEY, str(frontend)) or 0.0
-
-
-def _seconds(metadata: Mapping[str, str], key: str, where: str) -> float | None:
-    text = metadata.get(key)
-    if text is None:
-        return None
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0 <= seconds <= LONGEST_S:
-        raise DuagError(f"{where}: {key} is {text!r}, expected 0 to {LONGEST_S:g} seconds")
-    return seconds
+    return stated_seconds(log_metadata(frontend), FOUND_KEY, str(frontend), most_s=LONGEST_S) or 0.0
