@@ -14,9 +14,9 @@ import numpy as np
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.current_frame import CurrentFrame
+from duagc.pipeline.frontend.matching_keyframes import most_matching
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.registration.feature_motion import motion_from_features
-from duagc.pipeline.registration.features import matches
 
 
 def initial_motions(state: TrackingState, frame: CurrentFrame) -> Iterator[tuple[int, Array]]:
@@ -32,9 +32,7 @@ def initial_motions(state: TrackingState, frame: CurrentFrame) -> Iterator[tuple
     Yields:
         Keyframe index and T_keyframe_camera [4, 4].
     """
-    if (latest := initial_motion(state, frame, state.keyframe_index)) is not None:
-        yield state.keyframe_index, latest
-    for k in _other_keyframes(state, frame):
+    for k in _keyframes(state, frame):
         if (motion := initial_motion(state, frame, k)) is not None:
             yield k, motion
 
@@ -54,18 +52,13 @@ def initial_motion(state: TrackingState, frame: CurrentFrame, keyframe_index: in
     return found.T_first_second if found.accepted else None
 
 
-def _other_keyframes(state: TrackingState, frame: CurrentFrame) -> Iterator[int]:
-    """Keyframes near the one that frames are tracked against, those with most matches first."""
-    config, latest = state.config.tracking.relocalization, state.keyframe_index
-    centers = np.array([keyframe.center_map for keyframe in state.keyframes])
+def _keyframes(state: TrackingState, frame: CurrentFrame) -> Iterator[int]:
+    """Keyframes that are tried, as of `initial_motions`; the others are compared when the first one was not enough."""
+    latest, keyframes = state.keyframe_index, state.keyframes
+    yield latest
+    centers = np.array([keyframe.center_map for keyframe in keyframes])
     distance = np.linalg.norm(centers - centers[latest], axis=1)
     nearest = np.argsort(distance, kind="stable")[: state.config.keyframes.optimization_candidates].tolist()
-    most, theirs = config.features_compared, frame.features.descriptors[: config.features_compared]
-    scores = [
-        (-len(matches(state.keyframes[k].features.descriptors[:most], theirs, config.ratio)), -k)
-        for k in nearest
-        if k != latest
-    ]
-    for negative_score, negative_index in sorted(scores)[: config.candidates]:
-        if -negative_score >= config.min_matches:
-            yield -negative_index
+    others = [k for k in nearest if k != latest]
+    features, config = [keyframe.features for keyframe in keyframes], state.config.tracking.relocalization
+    yield from most_matching(frame.features, features, config, others)

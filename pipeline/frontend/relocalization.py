@@ -14,6 +14,7 @@ from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
+from duagc.pipeline.frontend.matching_keyframes import most_matching
 from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.pose_checks import FOUND_AGAIN, DoesNotFollowMovedThings, verify
 from duagc.pipeline.frontend.stable_registration import register_until_stable
@@ -21,7 +22,7 @@ from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.feature_motion import motion_from_features
-from duagc.pipeline.registration.features import Features, matches
+from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.place_index import PlaceIndex
 
 
@@ -45,14 +46,7 @@ def place_candidates(
     Yields:
         Keyframe index and T_keyframe_camera [4, 4].
     """
-    most = config.features_compared
-    scores = {
-        k: len(matches(keyframes[k].descriptors[:most], view.descriptors[:most], config.ratio)) for k in among
-    }
-    ranked = sorted(among, key=lambda k: (-scores[k], -k))
-    for k in ranked[: config.candidates]:
-        if scores[k] < config.min_matches:
-            return
+    for k in most_matching(view, keyframes, config, among):
         # the draws only choose which samples are tried: the same in every run
         rng = random_streams.generator(0, "relocalization", frame=frame_index, keyframe=k)
         found = motion_from_features(keyframes[k], view, config, rng)

@@ -27,7 +27,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import MotionPrior
-from duagc.pipeline.registration.features import matches
+from duagc.pipeline.registration.features import count_matches
 
 NO_SUBMAP = -1
 _UNUSABLE_IMAGES = frozenset(
@@ -164,9 +164,8 @@ class SubmapTracker:
         """Whether some keyframe shares enough features with a frame: else the submap is not searched."""
         limits = self.config.tracking.relocalization
         most, ratio = limits.features_compared, limits.ratio
-        view = frame.features.descriptors[:most]
         return any(
-            len(matches(keyframe.features.descriptors[:most], view, ratio)) >= limits.min_matches
+            count_matches(keyframe.features, frame.features, most, ratio) >= limits.min_matches
             for keyframe in tracker.alike(frame)
             if len(keyframe.features)
         )

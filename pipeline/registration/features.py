@@ -226,6 +226,18 @@ def matches(ours: Descriptors, theirs: Descriptors, ratio: float) -> NDArray[np.
     return matches_of(squared_distances(ours, theirs), ratio)
 
 
+def count_matches(ours: Features, theirs: Features, most: int, ratio: float) -> int:
+    """How many of the strongest features of two views match.
+
+    Args:
+        ours: of the first view.
+        theirs: of the second view.
+        most: number of the strongest features of each that are compared.
+        ratio: as of `matches`.
+    """
+    return len(matches(ours.descriptors[:most], theirs.descriptors[:most], ratio))
+
+
 def squared_distances(ours: Descriptors, theirs: Descriptors) -> NDArray[np.float32]:
     """Between descriptors, [n, m], exact integers.
 
