@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
@@ -22,20 +25,7 @@ def insert_first_keyframe(state: TrackingState, frame: CurrentFrame, reference: 
         frame: the current frame.
         reference: its samples.
     """
-    shelved = SHELF.put((reference, frame.features, frame.pyramid.levels[-1], frame.seen))
-    state.keyframes.append(
-        TrackedKeyframe(
-            keyframe_index=len(state.keyframes),
-            frame_index=frame.frame_index,
-            stamp_ns=frame.stamp_ns,
-            previous_index=-1,
-            T_map_keyframe=np.eye(4),
-            reference=shelved[0],
-            features=shelved[1],
-            coarsest=shelved[2],
-            seen=shelved[3],
-        )
-    )
+    state.keyframes.append(_keyframe(frame, 0, -1, np.eye(4), reference=reference))
 
 
 def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: PoseCandidate) -> int:
@@ -59,26 +49,34 @@ def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: PoseCand
     gain_before, offset_before = previous.exposure
     gain, offset = result.exposure
     reference = Reference.from_pyramid(frame.pyramid, state.config.tracking.strides)
-    shelved = SHELF.put((reference, frame.features, frame.pyramid.levels[-1], frame.seen))
-    state.keyframes.append(
-        TrackedKeyframe(
-            keyframe_index=new,
-            frame_index=frame.frame_index,
-            stamp_ns=frame.stamp_ns,
-            previous_index=previous.keyframe_index,
-            T_map_keyframe=T_map_keyframe,
-            reference=shelved[0],
-            features=shelved[1],
-            coarsest=shelved[2],
-            seen=shelved[3],
-            exposure=(gain * gain_before, gain * offset_before + offset),
-        )
-    )
+    keyframe = _keyframe(frame, new, previous.keyframe_index, T_map_keyframe, reference=reference)
+    exposure = gain * gain_before, gain * offset_before + offset
+    state.keyframes.append(replace(keyframe, exposure=exposure))
     return new
 
 
+def _keyframe(
+    frame: CurrentFrame, index: int, previous: int, T_map_keyframe: Array, *, reference: Reference
+) -> TrackedKeyframe:
+    """A frame as a keyframe, exposed as keyframe 0 is; its arrays are laid into a file."""
+    reference, features, coarsest, seen = SHELF.put(
+        (reference, frame.features, frame.pyramid.levels[-1], frame.seen)
+    )
+    return TrackedKeyframe(
+        keyframe_index=index,
+        frame_index=frame.frame_index,
+        stamp_ns=frame.stamp_ns,
+        previous_index=previous,
+        T_map_keyframe=T_map_keyframe,
+        reference=reference,
+        features=features,
+        coarsest=coarsest,
+        seen=seen,
+    )
+
+
 def _neighbor_registrations(
-    state: TrackingState, frame: CurrentFrame, previous: int, T_map_keyframe: np.ndarray
+    state: TrackingState, frame: CurrentFrame, previous: int, T_map_keyframe: Array
 ) -> list[RelativePose]:
     """A new keyframe registered to the earlier ones that see most of it, the one it was tracked from excepted."""
     limits = state.config.keyframes
