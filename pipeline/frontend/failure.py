@@ -29,7 +29,7 @@ ROWS_COMPARED_FIRST = 16  # every so many: two images of a moving camera differ 
 class Reason(Enum):
     """Why a frame has no pose, or only part of it was used; recorded in the log.
 
-    The first five are outcomes of the registration.
+    The four after NONE are outcomes of the registration.
     """
 
     NONE = ""

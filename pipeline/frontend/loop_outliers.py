@@ -39,7 +39,7 @@ def consistent_loops(
     """The loop closures that agree with the path and with each other.
 
     Args:
-        T_map_keyframes: [k, 4, 4], as tracked.
+        T_map_keyframes: [k, 4, 4], by the registrations of tracking; where the solution starts.
         tracked: registrations that connect the keyframes.
         loops: verified loop closures.
         config: how much drift is usual.

@@ -36,7 +36,7 @@ def find_loops(
     has only a robust weight in the graph.
 
     Args:
-        T_map_keyframes: [k, 4, 4], as tracked.
+        T_map_keyframes: [k, 4, 4], by the registrations of tracking.
         views: of the k keyframes.
         images: reads the images of a keyframe.
         config: limits.

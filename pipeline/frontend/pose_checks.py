@@ -73,7 +73,6 @@ class WellConstrained:
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
     ) -> PoseCandidate | Reason:
-        # along weak directions a prior knows the pose, or the outcome would not be OK
         """Reject it if its position is uncertain and something is in front of the camera.
 
         Args:
@@ -81,6 +80,7 @@ class WellConstrained:
             frame: the current frame.
             candidate: whose registration ended well.
         """
+        # along weak directions a prior knows the pose, or the outcome would not be OK
         covariance = np.linalg.pinv(candidate.result.information, rcond=1e-12, hermitian=True)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         if sigma_m <= state.config.tracking.failure.max_sigma_occluded_m:
