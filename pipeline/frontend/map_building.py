@@ -258,7 +258,7 @@ class MapBuilder:
                 *(self._keyframes[k].frame_index for k in tile),
                 *(f.frame_index for f in of_tile[number]),
             ]
-            mapper.open_shutter([self._moments(index) for index in views])
+            mapper.open_shutter([self.log.moments(index) for index in views])
             others = (number, self._whole.state(), self._poses, all_stats)
             before = sum(alone[:number])
             save = TileCheckpoints(self._checkpoints, others, found=found, before=before, total=steps)
@@ -323,10 +323,6 @@ class MapBuilder:
             self.exposures.at(frame_index),
             T_camera_moment=frame.T_camera_moment,
         )
-
-    def _moments(self, frame_index: int) -> Array | None:
-        """Where the camera is while its shutter is open, seen from the middle; None: it stands still."""
-        return None if self.log.shutter is None else self.log.frame(frame_index).T_camera_moment
 
     def _pose(self, keyframe: int) -> Array:
         """T_map_camera of a keyframe, as refined so far."""

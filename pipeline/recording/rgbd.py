@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline import messages
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import MAX_SIDE_PX, MIN_SIDE_PX, PinholeCamera
@@ -301,6 +302,21 @@ class RgbdLog:
         """
         found = self._geometry(*self._stamps(index), self.readout)
         return masks.masked_depth(self._of_scene(found.depth.depth_m), found.mask)
+
+    def moments(self, index: int) -> Array | None:
+        """Where the camera was while the shutter of one frame was open; its color is not read.
+
+        Args:
+            index: position in the log, 0 <= index < len(self).
+
+        Returns:
+            `RgbdFrame.T_camera_moment`, [k, 4, 4]; None: it stood still, or `open_shutter` was not called.
+        """
+        if self.shutter is None:
+            return None
+        stamp, depth_stamp = self._stamps(index)
+        depth_m = self._geometry(stamp, depth_stamp, self.readout).depth.depth_m
+        return self.shutter.moments(stamp, depth_m, self.camera)
 
     def _stamps(self, index: int) -> tuple[int, int | None]:
         """When color and depth of a frame were taken, nanoseconds."""

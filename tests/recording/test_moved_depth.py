@@ -219,6 +219,11 @@ def test_a_log_moves_its_depth_once_it_knows_how(tmp_path: Path) -> None:
         log.move_depth(trajectory([0, 1, 2, 3]))
         after = log.frame(2)
         assert np.array_equal(log.usable_depth(2), after.usable_depth)
+        assert log.moments(2) is None, "nobody said how long the shutter is open"
+        log.open_shutter(0.03, trajectory([0, 1, 2, 3]))
+        passed = log.frame(2).T_camera_moment
+        assert passed is not None
+        np.testing.assert_array_equal(log.moments(2), passed)
     true = depth_at(1e-9 * 2 * FRAME_NS)
     assert before.depth_offset_ns == after.depth_offset_ns == late_ns
     assert (before.depth_moved, after.depth_moved) == (False, True)
