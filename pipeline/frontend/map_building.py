@@ -34,11 +34,11 @@ from duagc.pipeline.frontend.tracked import TrackedFrame, tracked_path
 from duagc.pipeline.frontend.view_gain import ViewGain
 from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry.exposure import ExposureTrack
-from duagc.pipeline.geometry.masks import masked_depth
+from duagc.pipeline.geometry.masks import Mask, masked_depth
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.messages import Keyframe, MapUpdate
-from duagc.pipeline.recording import RgbdLog
+from duagc.pipeline.recording import RgbdFrame, RgbdLog
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.training_frames import seen_distance_m
 
@@ -313,7 +313,7 @@ class MapBuilder:
     def _posed(self, frame_index: int, T_map_tracked: Array) -> PosedRgbd:
         """A frame at its pose before refinement, by which it is known what moves."""
         frame = self.log.frame(frame_index)
-        mask = self._sights.free.usable(frame.usable_depth, T_map_tracked, frame.mask, index=frame_index)
+        mask = self._still_pixels(frame, T_map_tracked)
         return PosedRgbd(
             frame.color,
             masked_depth(frame.depth, mask),
@@ -323,6 +323,10 @@ class MapBuilder:
             self.exposures.at(frame_index),
             T_camera_moment=frame.T_camera_moment,
         )
+
+    def _still_pixels(self, frame: RgbdFrame, T_map_tracked: Array) -> Mask | None:
+        """Pixels [H, W] of a frame that show nothing that moves; None: all. Found once for a pose."""
+        return self._sights.free.usable(frame.usable_depth, T_map_tracked, frame.mask, index=frame.index)
 
     def _pose(self, keyframe: int) -> Array:
         """T_map_camera of a keyframe, as refined so far."""
@@ -338,7 +342,7 @@ class MapBuilder:
             frame.color,
             frame.depth,
             T_map_camera,
-            mask=self._sights.free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
+            mask=self._still_pixels(frame, keyframe.T_map_camera),
             depth_sigma_m=frame.depth_sigma,
             exposure=self.exposures.at(frame.index),
             information=keyframe.information,
@@ -354,7 +358,7 @@ class MapBuilder:
             frame.color,
             frame.depth,
             supporting.T_keyframe_camera,
-            mask=self._sights.free.usable(frame.usable_depth, T_map_camera, frame.mask),
+            mask=self._still_pixels(frame, T_map_camera),
             depth_sigma_m=frame.depth_sigma,
             exposure=self.exposures.at(frame.index),
             information=supporting.information,
