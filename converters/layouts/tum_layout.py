@@ -21,7 +21,7 @@ from duagc.pipeline.base.files import read_text
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.messages.parts import NANOSECONDS
-from duagc.pipeline.recording.pairing import TOLERANCE_KEY, TOLERANCE_NS
+from duagc.pipeline.recording.pairing import TOLERANCE_KEY, TOLERANCE_NS, nearest_indices
 
 LAST_NS = 1 << 62  # about the year 2116
 
@@ -136,8 +136,11 @@ def associate(
     """
     limit = options.limit_ns
     times = [d.stamp_ns for d in depth]
+    if not times:
+        return []
     if options.association != "official":
-        near = [(c, depth[j]) for c in color if (j := _nearest(times, c.stamp_ns)) is not None]
+        best = nearest_indices(_array([c.stamp_ns for c in color]), _array(times))
+        near = [(c, depth[j]) for c, j in zip(color, best.tolist(), strict=True)]
         return [(c, d) for c, d in near if abs(d.stamp_ns - c.stamp_ns) <= limit]
     candidates = []
     for i, c in enumerate(color):
@@ -156,11 +159,8 @@ def associate(
     return [(color[i], depth[j]) for i, j in sorted(pairs)]
 
 
-def _nearest(times: list[int], stamp_ns: int) -> int | None:
-    """Place of the nearest of sorted times, of two the earlier; None if there is none."""
-    after = bisect_left(times, stamp_ns)
-    around = [j for j in (after - 1, after) if 0 <= j < len(times)]
-    return min(around, key=lambda j: (abs(times[j] - stamp_ns), j), default=None)
+def _array(times_ns: list[int]) -> NDArray[np.int64]:
+    return np.array(times_ns, dtype=np.int64)
 
 
 def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
@@ -170,12 +170,8 @@ def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
         times_ns: sorted.
         others_ns: sorted.
     """
-    times, others = np.array(times_ns, dtype=np.int64), np.array(others_ns, dtype=np.int64)
-    after = np.searchsorted(others, times)
-    near = np.stack(
-        [others[np.clip(after, 0, len(others) - 1)], others[np.clip(after - 1, 0, len(others) - 1)]]
-    )
-    return float(np.abs(near - times).min()) / NANOSECONDS
+    times, others = _array(times_ns), _array(others_ns)
+    return float(np.abs(others[nearest_indices(times, others)] - times).min()) / NANOSECONDS
 
 
 @dataclass(frozen=True)

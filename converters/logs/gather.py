@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording.pairing import nearest_indices
 
 MOST_KEPT_BYTES = 512 << 20
 
@@ -67,10 +67,6 @@ def nearest(times_ns: Sequence[int], others_ns: Sequence[int], most_ns: int) -> 
     if not len(times_ns) or not len(others_ns):
         return {}
     ours, theirs = np.asarray(times_ns, np.int64), np.asarray(others_ns, np.int64)
-    after = np.clip(np.searchsorted(theirs, ours), 0, len(theirs) - 1)
-    before = np.maximum(after - 1, 0)
-    best: NDArray[np.int64] = np.where(
-        np.abs(theirs[before] - ours) <= np.abs(theirs[after] - ours), theirs[before], theirs[after]
-    )
+    best = theirs[nearest_indices(ours, theirs)]
     near = np.abs(best - ours) <= most_ns
     return dict(zip(ours[near].tolist(), best[near].tolist(), strict=True))

@@ -56,7 +56,7 @@ def pair(color_ns: Iterable[int], depth_ns: Iterable[int], tolerance_ns: int = T
     if len(color) == 0 or len(depth) == 0:
         alone = tuple(color.tolist())
         return Pairing(tuple((stamp, None) for stamp in alone), alone, tuple(depth.tolist()), tolerance_ns)
-    nearest = _nearest(color, depth)
+    nearest = nearest_indices(color, depth)
     near = np.abs(depth[nearest] - color) <= tolerance_ns
     pairs = tuple(
         (stamp, partner if has else None)
@@ -86,8 +86,17 @@ def _tolerance_ns(log: LogFile) -> int:
     return TOLERANCE_NS if seconds is None else round(seconds * 1e9)
 
 
-def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Index of the nearest of `others` (sorted) to each of `times`; of two as near the earlier."""
-    after = np.clip(np.searchsorted(others, times), 0, len(others) - 1)
+def nearest_indices(times_ns: NDArray[np.int64], others_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Which of other times is the nearest to each of some times; of two as near the earlier.
+
+    Args:
+        times_ns: [n].
+        others_ns: [m], sorted, at least one.
+
+    Returns:
+        Indices [n] of the others.
+    """
+    after = np.clip(np.searchsorted(others_ns, times_ns), 0, len(others_ns) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(np.abs(others[before] - times) <= np.abs(others[after] - times), before, after)
+    is_before = np.abs(others_ns[before] - times_ns) <= np.abs(others_ns[after] - times_ns)
+    return np.where(is_before, before, after)
