@@ -23,6 +23,7 @@ from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pos
 from duagc.pipeline.frontend.submaps import TrackedSubmap
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 from duagc.pipeline.posegraph.cycle_consistency import Placement, Proposal, place
 from duagc.pipeline.posegraph.loop_closures import (
     Group,
@@ -219,8 +220,7 @@ def _agreement(
 ) -> float:
     """Share of the samples of the second submap that keyframes of the first see at the same place."""
     coarse = [keyframe.coarsest for keyframe in submaps[0].keyframes]
-    with np.errstate(divide="ignore"):
-        depths = [np.where(c.inverse_depth > 0, 1 / c.inverse_depth, 0).astype(np.float32) for c in coarse]
+    depths = [inverse_or_zero(c.inverse_depth) for c in coarse]
     samples = [keyframe.reference.levels[-1].points for keyframe in submaps[1].keyframes]
     T_first_keyframe, T_second_keyframe = (p.T_frame_keyframe for p in poses)
     return surface_agreement(

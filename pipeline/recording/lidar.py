@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 from duagc.pipeline.geometry.projection import inside
 from duagc.pipeline.kernels.drawn_depth import drawn_triangles
 from duagc.pipeline.kernels.drawn_depth_definition import Indices, largest
@@ -56,7 +57,7 @@ def lidar_depth(
     hit = visible[largest(pixel[visible], inverse[visible])]
 
     known = between > 0
-    depth = np.where(known, 1 / np.where(known, between, 1), 0)
+    depth = inverse_or_zero(between)
     sigma = np.where(known, np.hypot(range_sigma_m, SIGMA_OF_CHANGE * change), 0)
     depth[pixel[hit]], sigma[pixel[hit]] = points[hit, 2], range_sigma_m
     shape = camera.height, camera.width

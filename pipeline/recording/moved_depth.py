@@ -11,6 +11,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording.depth_sources import DepthImage
 from duagc.pipeline.recording.read import log_metadata, read_log
@@ -67,13 +68,13 @@ def move_depth(depth: DepthImage, camera: PinholeCamera, T_color_depth: Array) -
     if not _move_px(depth.depth_m, camera, T_color_depth, 50) >= LEAST_MOVE_PX:
         return depth
     known = depth.depth_m > 0
-    inverse = np.where(known, 1 / np.where(known, depth.depth_m, 1), 0).astype(np.float32)
+    inverse = inverse_or_zero(depth.depth_m).astype(np.float32)
     farthest_px = _move_px(depth.depth_m, camera, T_color_depth, 1)
     side = 2 * min(int(np.ceil(farthest_px)) + 1, FARTHEST_EDGE_PX) + 1
     nearest = np.asarray(cv2.dilate(inverse, np.ones((side, side), dtype=np.uint8)), dtype=np.float32)
     middle = float(np.median(inverse[known]))
     found, u, v = found_points(inverse, nearest, camera, T_color_depth, middle=middle)
-    moved = np.where(found > 0, 1 / np.where(found > 0, found, 1), np.float32(0))
+    moved = inverse_or_zero(found)
     if depth.sigma_m is None:
         return DepthImage(moved)
     return DepthImage(moved, np.where(found > 0, _nearest(depth.sigma_m, u, v), np.float32(0)))

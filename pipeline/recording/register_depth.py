@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 from duagc.pipeline.kernels.drawn_depth import registered_depth
 
 Image = NDArray[np.float32]
@@ -42,7 +43,6 @@ def register_depth(
     Returns:
         float32 [camera.height, camera.width], meters along z of `camera`, 0 = unknown.
     """
-    known = depth_m > 0
-    inverse = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float64)
+    inverse = inverse_or_zero(depth_m).astype(np.float64)
     steps = sample_steps(depth_camera, camera)
     return registered_depth(inverse, depth_camera, T_camera_depth, camera, steps=steps)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 from duagc.pipeline.recording.depth_motion import DepthMotion
 from duagc.pipeline.recording.depth_sources import DepthImage
 from duagc.pipeline.recording.read import log_metadata
@@ -344,7 +345,7 @@ def _mean_inverse(depth_m: Image, rows: Array, columns: Array) -> Array:
     sampled = depth_m[::SAMPLE_PX, ::SAMPLE_PX]
     side = (2 * STEP_PX // SAMPLE_PX + 1,) * 2
     known = sampled > 0
-    inverse = np.where(known, 1 / np.where(known, sampled, 1), 0).astype(np.float32)
+    inverse = inverse_or_zero(sampled).astype(np.float32)
     share = cv2.blur(known.astype(np.float32), side)
     mean = cv2.blur(inverse, side) / np.maximum(share, 1e-6)
     middle = float(np.median(inverse[known])) if known.any() else 1.0

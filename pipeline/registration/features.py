@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
@@ -196,8 +197,7 @@ def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> 
     small = levels[at].camera.width * levels[at].camera.height < LEAST_PX
     level = levels[at - 1 if at and small else at]
     gray = np.rint(np.clip(level.gray, 0, 1) * 255).astype(np.uint8)
-    known = level.inverse_depth > 0
-    depth_m = np.where(known, 1 / np.where(known, level.inverse_depth, 1), 0).astype(np.float32)
+    depth_m = inverse_or_zero(level.inverse_depth)
     return extract_from_gray(gray, depth_m, level.camera, most, mask=level.mask)
 
 

@@ -18,6 +18,7 @@ from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 from duagc.pipeline.geometry.masks import large_regions
 from duagc.pipeline.geometry.projection import FREE, ON_SURFACE, back_project, free_space, largest_of_3x3
 from duagc.pipeline.registration.pyramid import Level
@@ -128,8 +129,7 @@ class FreeSpace:
         return found
 
     def _view(self, depth_m: Image, T_map_camera: Array) -> _View:
-        known = depth_m > 0
-        inverse = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float32)
+        inverse = inverse_or_zero(depth_m).astype(np.float32)
         level = Level(self._camera, inverse, inverse)
         for _ in range(self.config.halvings):
             level = level.halved()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 
 SENSOR_FOCAL_PX = 580.0
 BASELINE_M = 0.075
@@ -87,7 +88,7 @@ def quantized(depth: Array, step_m: float) -> Array:
     """
     if step_m == 0:
         return depth
-    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), 0.0)
+    inverse = inverse_or_zero(depth)
     quanta = np.rint(inverse / step_m)
     return np.where(quanta > 0, 1 / (step_m * np.maximum(quanta, 1.0)), 0.0)
 
@@ -121,14 +122,14 @@ def _mixed(depth: Array, dice: Array) -> Array:
 
 def _shadowed(depth: Array, camera: PinholeCamera) -> NDArray[np.bool_]:
     """Pixels that the projector, a base line to the left of the camera, cannot reach past nearer things."""
-    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), 0.0)
+    inverse = inverse_or_zero(depth)
     column = np.arange(camera.width) + camera.fx * BASELINE_M * inverse
     return column + 0.5 < np.maximum.accumulate(column, axis=1)
 
 
 def _incidence_cosine(depth: Array, camera: PinholeCamera) -> Array:
     """Cosine of the angle between a pixel's ray and the surface normal, [h, w]; inverse depth of a plane is linear."""
-    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), 0.0)
+    inverse = inverse_or_zero(depth)
     du, dv = _gentler_slope(inverse, 1), _gentler_slope(inverse, 0)
     rays = camera.rays()
     nx, ny = camera.fx * du, camera.fy * dv
