@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cached_property, partial
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -25,15 +23,15 @@ from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from duagc.converters.logs.entries import Entry, time_of
 from duagc.converters.logs.files import Log, is_own_log
-from duagc.converters.logs.frames import TF_TYPES, Transforms, frame_name
+from duagc.converters.logs.frames import Transforms, frame_name
 from duagc.converters.logs.gather import gathered
+from duagc.converters.logs.image_times import ImageTimes, look_through
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.registration import ImageTopic, check_infos, check_samples, extrinsics
 from duagc.converters.logs.stamps import clock_words, paired
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.lens import Lens, Maps
 from duagc.pipeline.geometry.masks import Mask
@@ -272,50 +270,25 @@ class RobotLog:
         return time_of(entry, self.settings.time_source, self.name)
 
     @cached_property
-    def _seen(self) -> dict[str, array[int]]:
-        """Times of the images by topic. Looks through the log once, for all that is to be known before the images."""
-        stamps = {self.color: array("q"), self.depth: array("q")}
-        delays, recorded = array("q"), array("q")
-        least_ns: dict[str, int] = {}
-
-        def take_stamp(entry: Entry) -> int:
-            stamp_ns = self.time_ns(entry)
-            if stamp_ns:  # else nobody set it: such images are left out
-                delay_ns = entry.log_ns - stamp_ns
-                least_ns[entry.topic] = min(least_ns.get(entry.topic, delay_ns), delay_ns)
-            return stamp_ns
-
-        def take_image(entry: Entry) -> None:
-            stamp_ns = take_stamp(entry)
-            stamps[entry.topic].append(stamp_ns)
-            if stamp_ns:
-                delays.append(entry.log_ns - stamp_ns)
-                recorded.append(entry.log_ns)
-
+    def _seen(self) -> ImageTimes:
+        """Times of the images. Looks through the log once, for all that is to be known before the images."""
         cameras = CameraWatch(self._cameras, self.name)
-        takers: list[tuple[str, Callable[[Entry], object]]] = [*self._motion.take]
-        takers += [(topic, take_stamp) for topic, _ in takers if self.log.topics[topic].type not in TF_TYPES]
-        takers += [(topic, take_image) for topic in stamps]
-        takers += [(topic, cameras.see) for topic in self._cameras]
-        total = sum(self.log.topics[topic].count for topic in {topic for topic, _ in takers})
-        entries = self.log.entries(*sorted({topic for topic, _ in takers}), heads=stamps)
-        for entry in track(entries, f"look through {PurePath(self.name).name}", total):
-            for topic, take in takers:
-                if topic == entry.topic:
-                    take(entry)
+        infos = [(topic, cameras.see) for topic in self._cameras]
+        images = self.color, self.depth
+        seen = look_through(self.log, images, self._motion.take, infos, time_ns=self.time_ns)
         if self.settings.time_source == "header":
+            least_ns = dict(seen.least_delay_ns)
             if self.settings.truth in least_ns:
                 least_ns[self.settings.truth] -= round(self.settings.truth_offset_s * NANOSECONDS)
             self.warnings += clock_words(least_ns, self.color)
-        self._delays_ns = np.array(delays, dtype=np.int64)
-        self._image_ns = np.array(recorded, dtype=np.int64) - self._delays_ns
-        return stamps
+        return seen
 
     @cached_property
     def drift(self) -> Drift | None:
         """How the clocks of headers and recorder differ in rate; None if that is not known, or was not asked for."""
-        self._seen  # noqa: B018
-        return drift(self._image_ns, self._delays_ns) if self.settings.time_source == "header" else None
+        if self.settings.time_source != "header":
+            return None
+        return drift(self._seen.stamps_ns, self._seen.delays_ns)
 
     def settle_drift(self) -> None:
         """Bring the times of the headers to the rate of the recorder's clock, if that matters and was asked for."""
@@ -325,8 +298,7 @@ class RobotLog:
             self.warnings.append(f"{self.drift.words()}; expected one rate, or --set clocks=estimated")
             return
         self.warnings.append(f"{self.drift.words()}; taken out")
-        self._rate, self._origin_ns = self.drift.rate, int(self._image_ns.min())
-        self._delays_ns -= np.rint(self._rate * (self._image_ns - self._origin_ns)).astype(np.int64)
+        self._rate, self._origin_ns = self.drift.rate, int(self._seen.stamps_ns.min())
 
     def written_ns(self, stamp_ns: int) -> int:
         """The time of the recording for a time of the log: by the robot's clock as it was settled.
@@ -340,7 +312,7 @@ class RobotLog:
     def pairs(self) -> dict[int, int | None]:
         """Time of a color image -> time of its depth image; None: none is near, and the camera is followed by color."""
         topics, options = (self.color, self.depth), self.settings
-        pairs = paired(self.name, topics, self._seen, options, warnings=self.warnings)
+        pairs = paired(self.name, topics, self._seen.by_topic, options, warnings=self.warnings)
         if min(pairs) + self.shift_ns < 0:
             raise DuagError(f"{self.name}: clock_offset_s = {self.settings.clock_offset_s} leads before 1970")
         return pairs
@@ -362,7 +334,8 @@ class RobotLog:
         Args:
             robot: its name in the recording.
         """
-        first, last = min(self.pairs), max(self.pairs)
+        first, last, seen = min(self.pairs), max(self.pairs), self._seen
+        gained_ns = np.rint(self._rate * (seen.stamps_ns - self._origin_ns)).astype(np.int64)
         header = self.settings.time_source == "header"
         files = frozenset(part.path for part in self.log.parts if self.color in part.topics)
         return RobotClock(
@@ -370,7 +343,7 @@ class RobotLog:
             self.log,
             files,
             self.namespace,
-            delays_ns=self._delays_ns,
+            delays_ns=seen.delays_ns - gained_ns,
             start_ns=first,
             end_ns=last,
             header=header,
