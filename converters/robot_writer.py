@@ -24,11 +24,7 @@ from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import Lens, seen_by_source
-from duagc.pipeline.recording import (
-    DEPTH_SCALE_KEY,
-    RANGE_SIGMA_KEY,
-    LogWriter,
-)
+from duagc.pipeline.recording import DEPTH_SCALE_KEY, RANGE_SIGMA_KEY, LogWriter
 from duagc.pipeline.recording.copies import image_digest
 from duagc.schemas import topics
 
@@ -78,6 +74,7 @@ class RobotWriter:
         self._valid = mask_of_user(name, camera.width, camera.height)
         self._regions = FoundRegions() if find_regions else None
         self._lens: Lens | None = None
+        self._depth_camera: PinholeCamera | None = None  # of its own
         self._colors: set[int] = set()  # digests of the color images
         self._shares: dict[str, float] = {}  # of the pixels that were found to show something else
         # topic of a sensor's pose in the camera that is still to be written
@@ -271,10 +268,11 @@ class RobotWriter:
             stamp_ns: its time, not before that of the message before.
             depth: uint16 [h, w] along the depth camera's z, 0 = none.
         """
-        if depth.shape != (self._depth_camera.height, self._depth_camera.width):
-            raise ValueError(f"an image is {depth.shape}, expected that of {self._depth_camera}")
+        camera = self._depth_camera
+        if camera is None or depth.shape != (camera.height, camera.width):
+            raise ValueError(f"an image is {depth.shape}, expected that of a depth camera: {camera}")
         if self._announce(topics.RAW_DEPTH_TRANSFORM, stamp_ns, "depth_camera"):
-            calibration = messages.pack_calibration(stamp_ns, self.name, self._depth_camera)
+            calibration = messages.pack_calibration(stamp_ns, self.name, camera)
             self._log.write(topics.RAW_DEPTH_CALIBRATION.of(self.name), calibration, stamp_ns)
         message = messages.pack_depth(stamp_ns, self.name, depth)
         self._log.write(topics.RAW_DEPTH.of(self.name), message, stamp_ns)

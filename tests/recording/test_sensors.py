@@ -190,6 +190,8 @@ def test_sensors_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with RobotWriter(tmp_path, "alpha", CAMERA, 0.001) as robot:
         with pytest.raises(ValueError, match="an image is"):
             robot.add_frame(0, b"", "png", None, depth_sigma_m=np.zeros((2, 2)))
+        with pytest.raises(ValueError, match="expected that of a depth camera: None"):
+            robot.add_depth(0, np.zeros((3, 4), np.uint16))
         robot.set_depth_camera(PinholeCamera(4, 3, 5, 5, 1, 1), np.eye(4), 0.001)
         with pytest.raises(ValueError, match="an image is"):
             robot.add_depth(0, np.zeros((4, 4), np.uint16))
