@@ -1,6 +1,5 @@
 """The command `duagc`. Every command imports what it needs when it runs, so that `--help` is quick."""
 
-import errno
 import sys
 from io import TextIOWrapper
 
@@ -9,6 +8,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.said_lines import open_closed_streams
 from duagc.pipeline.base.stop_signals import ending_as_interrupts
 from duagc.pipeline.cli.common import EXIT_FAILED, app
+from duagc.pipeline.cli.failures import line_of
 
 # each registers its commands, and `--help` lists them in this order
 # isort: off
@@ -44,9 +44,6 @@ __all__ = [
 ]
 
 TYPER_INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
-COMPILED = ("duagc.pipeline.kernels._raster", "duagc.converters.simulate.render._flat_surfaces")
-"""Modules that a source tree lacks before they are built."""
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, a limit on files
 
 
 def main() -> None:
@@ -62,17 +59,11 @@ def main() -> None:
     except DuagError as error:
         print(f"duagc: {error}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
-    except ImportError as error:
-        if error.name not in COMPILED:
+    except Exception as error:
+        line = line_of(error)
+        if line is None:
             raise
-        print(f"duagc: {error}", file=sys.stderr)
-        sys.exit(EXIT_FAILED)
-    except OSError as error:
-        if error.errno not in NO_ROOM and not error.filename:
-            raise
-        where = f"{error.filename}: " if error.filename else ""
-        expected = ", expected room for the output" if error.errno in NO_ROOM else ""
-        print(f"duagc: {where}{error.strerror}{expected}", file=sys.stderr)
+        print(f"duagc: {line}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
     except KeyboardInterrupt:
         print("duagc: interrupted", file=sys.stderr)
