@@ -99,13 +99,8 @@ def _settle(replaced: Path, out: Path) -> None:
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """An empty folder that is this process's alone; what a killed one has left in it is removed."""
+    lock = _lock_of(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise DuagError(f"{folder}: {error.strerror or error}, expected to write a folder") from error
-    try:
-        _take(lock, folder)
         for path in folder.iterdir():
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
@@ -116,11 +111,46 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(lock)
 
 
+def _lock_of(folder: Path) -> int:
+    """Make a folder and lock it, again where another process renames or removes it meanwhile."""
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = _opened(folder)
+        except OSError as error:
+            raise DuagError(f"{folder}: {error.strerror or error}, expected to write a folder") from error
+        if lock is None:
+            continue
+        try:
+            _take(lock, folder)
+            if _is_named(lock, folder):
+                return lock
+        except BaseException:
+            os.close(lock)
+            raise
+        os.close(lock)
+
+
+def _opened(folder: Path) -> int | None:
+    try:
+        return os.open(folder, os.O_RDONLY)
+    except FileNotFoundError:  # it was there a moment ago
+        return None
+
+
 def _take(lock: int, folder: Path) -> None:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the kernel gives it up with the process
     except BlockingIOError as error:
         raise DuagError(f"{folder}: another process is writing it; wait, or choose another --out") from error
+
+
+def _is_named(lock: int, folder: Path) -> bool:
+    """Whether what is locked still has the name: its last owner may have given it another one, or removed it."""
+    try:
+        return os.path.samestat(os.fstat(lock), os.stat(folder))
+    except FileNotFoundError:
+        return False
 
 
 def _check_out(out: Path, force: bool, kind: tuple[str, tuple[str, ...]]) -> None:

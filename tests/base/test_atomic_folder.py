@@ -111,3 +111,32 @@ def test_an_input_that_is_a_link_to_itself_is_told_in_one_line(tmp_path: Path) -
     (tmp_path / "settings.toml").symlink_to(tmp_path / "settings.toml")
     with pytest.raises(DuagError, match=r"settings\.toml: a link that leads back to itself"):
         check_apart(tmp_path / "out", [tmp_path / "settings.toml"])
+
+
+@pytest.mark.parametrize("ends_well", [True, False], ids=["renamed", "removed"])
+def test_a_folder_whose_owner_ends_while_it_is_locked_is_not_taken_for_a_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_well: bool
+) -> None:
+    """Between opening the folder and locking it another process gives it its name, or removes it."""
+    out, part, lock = tmp_path / "run", tmp_path / "run.part", atomic_folder._take
+    begun = []
+
+    def late(descriptor: int, folder: Path) -> None:
+        if not begun:
+            begun.append(folder)
+            if ends_well:
+                (part / "manifest.json").write_text("of the other one")
+                part.rename(out)
+            else:
+                part.rmdir()
+        lock(descriptor, folder)
+
+    monkeypatch.setattr(atomic_folder, "_take", late)
+    if ends_well:
+        with pytest.raises(DuagError, match="exists already"), new_folder(out, force=False):
+            pytest.fail("there is a run")
+        assert content(out) == {"manifest.json": "of the other one"}
+    else:
+        write(out, "new")
+        assert content(out) == {"manifest.json": "new", "fused.mcap": "new"}
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
