@@ -90,6 +90,32 @@ def test_every_candidate_of_a_run_can_be_asked_for_with_its_reason(small_run: Pa
     assert len(lines) == 1 + len(candidates) + 2 + len(facts["verdicts"])
 
 
+def packet(kind: str, send_ns: int, *deliver_ns: int) -> SimpleNamespace:
+    return SimpleNamespace(
+        sender="alpha", receiver="bravo", kind_name=kind, send_ns=send_ns, deliver_ns=deliver_ns
+    )
+
+
+@pytest.mark.parametrize(
+    ("packets", "reason"),
+    [
+        ([], "no packet was sent"),
+        ([packet("HELLO", 0), packet("HELLO", 9)], "of 2 packets none arrived in time"),
+        (
+            [packet("HELLO", 0, 10), packet("HELLO", 9)],
+            "of 2 packets none arrived in time",
+        ),  # after the session
+        ([packet("HELLO", 0, 1), packet("DESCRIPTORS", 9)], "of 2 packets 1 arrived in time, none with desc"),
+        ([packet("DESCRIPTORS", 0, 1)] * 2 + [packet("ACK", 9)], "2 with descriptors; no keyframe of one"),
+    ],
+)
+def test_no_candidate_has_its_reason(tmp_path: Path, packets: list[SimpleNamespace], reason: str) -> None:
+    """A robot that hears nothing is not one whose keyframes resemble no other."""
+    inspector = Inspector(RunFolder(fake_run.make(tmp_path).run))
+    vars(inspector).update(_session=SimpleNamespace(packets=packets), _consensus=lambda topic, robot: [])
+    assert reason in format_loop_closures(inspector.loop_closures())
+
+
 def test_the_exchange_of_a_run_can_be_repeated_under_faults(small_run: Path, small_recording: Path) -> None:
     settings = load_config(RunConfig, small_run / "config.toml", [])
     checks = ["frames", "names", "closures", "silence", "solver"]

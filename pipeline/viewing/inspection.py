@@ -138,7 +138,8 @@ class Inspector:
             robot: only candidates that this robot took part in, as the one that decided or as its peer.
 
         Returns:
-            "candidates": rows with the names of `labels.LOOP_CLOSURE`; "verdicts": how many candidates have each.
+            "candidates": rows with the names of `labels.LOOP_CLOSURE`; "verdicts": how many candidates have each;
+            without a candidate "packets": how many were sent and arrived, and how many with descriptors.
 
         Raises:
             DuagError: the run has no such robot.
@@ -154,7 +155,14 @@ class Inspector:
             if robot in (None, decision.robot, decision.peer)
         ]
         rows = labels.loop_closures(decisions)
-        return {"candidates": rows, "verdicts": labels.verdict_counts(rows)}
+        facts: Facts = {"candidates": rows, "verdicts": labels.verdict_counts(rows)}
+        if not rows:
+            end_ns = max((p.send_ns for p in self._session.packets), default=0)
+            sent = [p for p in self._session.packets if robot in (None, p.sender, p.receiver)]
+            arrived = [p for p in sent if p.deliver_ns and min(p.deliver_ns) <= end_ns]
+            described = sum(Kind[p.kind_name] is Kind.DESCRIPTORS for p in arrived)
+            facts["packets"] = {"sent": len(sent), "arrived": len(arrived), "with_descriptors": described}
+        return facts
 
     # --- one packet
 
@@ -320,15 +328,30 @@ def _described(theta: np.ndarray) -> Facts:
     }
 
 
+def _why_none(packets: dict[str, int]) -> str:
+    """Why there is no candidate, by the packets that were sent and arrived."""
+    sent, arrived, described = packets.values()
+    if not sent:
+        return "no packet was sent"
+    if not arrived:
+        return f"of {sent} packets none arrived in time"
+    if not described:
+        return f"of {sent} packets {arrived} arrived in time, none with descriptors"
+    return (
+        f"of {sent} packets {arrived} arrived in time, {described} with descriptors; "
+        "no keyframe of one robot resembled one of another by them"
+    )
+
+
 def format_loop_closures(facts: Facts) -> str:
     """Candidates for loop closures as a table, then how many have each verdict.
 
     Args:
-        facts: of the candidates, with "candidates" and "verdicts".
+        facts: of the candidates, as `Inspector.loop_closures` gives them.
     """
     rows = facts["candidates"]
     if not rows:
-        return "no candidates: no keyframe of one robot resembled one of another"
+        return f"no candidates: {_why_none(facts['packets'])}"
     cells = [[label for label, _ in labels.LOOP_CLOSURE.values()]]
     cells += [[labels.text(name, row[name]) for name in labels.LOOP_CLOSURE] for row in rows]
     widths = [max(len(row[column]) for row in cells) for column in range(len(labels.LOOP_CLOSURE))]
