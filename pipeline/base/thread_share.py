@@ -11,6 +11,7 @@ from ctypes import c_int
 from typing import Any
 
 from duagc.pipeline.base.machine import processors
+from duagc.pipeline.base.stop_signals import start_resource_tracker
 
 _of_this_process: list[tuple[c_int, int]] = []
 
@@ -34,8 +35,12 @@ class ThreadShare:
             workers: processes, each with one task at a time.
             tasks: how many there are.
             in_all: threads of all processes together; None: as many as this process may use.
+
+        Raises:
+            DuagError: this machine has no place where processes can share what they know.
         """
         self._workers, self._left, self._lock = workers, tasks, threading.Lock()
+        start_resource_tracker()
         self._busy = multiprocessing.get_context("spawn").RawValue(c_int, max(1, min(workers, tasks)))
         self._in_all = in_all or processors()
 

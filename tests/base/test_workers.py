@@ -1,17 +1,20 @@
 """Worker processes end with their task, with their parent, and never silently."""
 
+import errno
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from duagc.pipeline.base import worker_reports
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.thread_share import ThreadShare
 from duagc.pipeline.base.workers import LOW_PRIORITY, when_idle, worker_pool
 
 ROOT = Path(__file__).parents[2]
@@ -36,6 +39,20 @@ def wait_until_gone(pid: int) -> bool:
 def test_a_killed_worker_is_one_line() -> None:
     with pytest.raises(DuagError, match="worker process ended"), worker_pool(1) as pool:
         pool.submit(os.kill, pool.submit(os.getpid).result(), signal.SIGKILL).result()
+
+
+@pytest.mark.parametrize("begin", [lambda: worker_pool(1).__enter__(), lambda: ThreadShare(1, 1)])
+def test_a_machine_without_shared_memory_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, begin: Callable[[], object]
+) -> None:
+    """Its locks are files there; of a folder that is missing the system names none."""
+
+    def refuse(*_: object) -> None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+
+    monkeypatch.setattr("_multiprocessing.SemLock", refuse)
+    with pytest.raises(DuagError, match=r"^/dev/shm: No such file or directory, expected a folder"):
+        begin()
 
 
 def test_an_error_ends_the_tasks_of_the_others() -> None:
