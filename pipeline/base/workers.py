@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from ctypes import c_bool
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,11 @@ from duagc.pipeline.base.stop_signals import held_back, leave_to_parent, start_r
 
 LOW_PRIORITY = 10
 """Nice value of what can wait: a tenth of a processor is left to it next to a task that cannot."""
+NOT_BEGUN = (
+    "a worker process could not import the main script, expected a file with its work under "
+    '`if __name__ == "__main__":`'
+)
+ENDED = "a worker process ended before its task, expected it to finish; was it killed, or out of memory?"
 LAST = -100  # of what a process does at its end
 _handed_down: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
 
@@ -54,11 +60,13 @@ def worker_pool(
     """
     start_resource_tracker()
     before = {child.pid for child in multiprocessing.active_children()}
+    context = multiprocessing.get_context("spawn")
+    begun = context.RawValue(c_bool, False)
     pool = ProcessPoolExecutor(
         workers,
-        multiprocessing.get_context("spawn"),
+        context,
         _begin,
-        (pickle.dumps([(learn, known()) for known, learn in _handed_down]), start, arguments),
+        (begun, pickle.dumps([(learn, known()) for known, learn in _handed_down]), start, arguments),
     )
     try:
         yield pool
@@ -68,9 +76,7 @@ def worker_pool(
                 child.terminate()
         pool.shutdown(cancel_futures=True)
         if isinstance(error, BrokenProcessPool):
-            raise DuagError(
-                "a worker process ended before its task, expected it to finish; was it killed, or out of memory?"
-            ) from error
+            raise DuagError(ENDED if begun.value else NOT_BEGUN) from error
         raise
     pool.shutdown()
 
@@ -93,8 +99,11 @@ def _nothing() -> None:
     """That a process is asked for it makes it start."""
 
 
-def _begin(handed_down: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
+def _begin(
+    begun: c_bool, handed_down: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]
+) -> None:
     leave_to_parent()
+    begun.value = True
     threading.Thread(target=end_with_parent, daemon=True).start()
     multiprocessing.util.Finalize(None, _end, exitpriority=LAST)
     # what it is of is imported here, and not before Ctrl-C is the parent's

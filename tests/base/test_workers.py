@@ -41,6 +41,21 @@ def test_a_killed_worker_is_one_line() -> None:
         pool.submit(os.kill, pool.submit(os.getpid).result(), signal.SIGKILL).result()
 
 
+@pytest.mark.parametrize("how", ["file", "input"])
+def test_a_script_that_workers_cannot_import_is_said_to_be_one(tmp_path: Path, how: str) -> None:
+    """Without a guard it would begin again in each of them; standard input is no file that they could read."""
+    text = "import os\nfrom duagc.pipeline.base.workers import worker_pool\n"
+    text += "with worker_pool(1) as pool:\n    pool.submit(os.getpid).result()\n"
+    script = tmp_path / "script.py"
+    script.write_text(text)
+    words = [sys.executable, str(script) if how == "file" else "-"]
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, env=env, input=text, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.endswith('expected a file with its work under `if __name__ == "__main__":`')
+
+
 @pytest.mark.parametrize("begin", [lambda: worker_pool(1).__enter__(), lambda: ThreadShare(1, 1)])
 def test_a_machine_without_shared_memory_is_one_line(
     monkeypatch: pytest.MonkeyPatch, begin: Callable[[], object]
