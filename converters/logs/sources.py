@@ -88,7 +88,8 @@ def sources_of(src: Path, options: Mapping[str, Any]) -> list[Source]:
         _check_shared(settings, spaces)
     if len(set(names)) < len(names):
         raise DuagError(
-            f"{src}: namespaces {', '.join(spaces)} name a robot twice, expected different robots"
+            f"{src}: namespaces {', '.join(spaces)} name a robot twice, expected different robots, or a TOML file "
+            "with [robots.NAME] and its namespace for each"
         )
     return [
         Source(name, paths, space, label, _filled(settings, space))

@@ -159,3 +159,15 @@ def test_an_mcap_whose_summary_repeats_no_channels(tmp_path: Path) -> None:
         writer.finish()
     registry.convert("ros", tmp_path / "x.mcap", tmp_path / "rec")
     assert info(tmp_path / "rec")["robots"]["alpha"]["frames"] == 4
+
+
+def test_robots_that_differ_by_capitals_are_named_by_a_file(tmp_path: Path) -> None:
+    r, spaces = Ros(2), ("/Alpha", "/alpha")
+    rows = [row for space in spaces for row in still(r, (f"{space}/image", space), (f"{space}/depth", space))]
+    r.write(tmp_path / "team", rows, "sqlite3")
+    with pytest.raises(DuagError, match=r"name a robot twice, expected .* with \[robots\.NAME\] and its"):
+        sources_of(tmp_path / "team", {"namespaces": ",".join(spaces)})
+    names = {"one": "/Alpha", "two": "/alpha"}
+    listed = [f'[robots.{name}]\nlogs = ["team"]\nnamespace = "{space}"\n' for name, space in names.items()]
+    (tmp_path / "team.toml").write_text("".join(listed))
+    assert {s.robot: s.namespace for s in sources_of(tmp_path / "team.toml", {})} == names
