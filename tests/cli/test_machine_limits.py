@@ -4,6 +4,7 @@ import errno
 import os
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -22,6 +23,12 @@ def array_memory_error() -> MemoryError:
     return caught.value
 
 
+def opencv_error(code: int) -> cv2.error:
+    error = cv2.error("Failed to allocate 307200 bytes")
+    error.code = code
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "found", "expected"),
     [
@@ -32,6 +39,7 @@ def array_memory_error() -> MemoryError:
         (RuntimeError("can't start new thread"), "can't start new thread", "ulimit -u"),
         (ImportError(LIBRARY), "libscipy_openblas.so", "ulimit -v"),
         (MemoryError(), "out of memory", "ulimit -v"),
+        (opencv_error(-4), "Failed to allocate", "ulimit -v"),
         (array_memory_error(), "Unable to allocate", "ulimit -v"),
     ],
     ids=str,
