@@ -20,13 +20,14 @@ from duagc.pipeline.frontend.feature_checks import (
     FeaturesAllowWorseLook,
     FeaturesConfirm,
     FeaturesDoNotContradict,
+    farthest_m,
     from_prediction,
 )
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.feature_judgment import angles_between
+from duagc.pipeline.registration.feature_motion import features_agree
 from duagc.pipeline.registration.features import matches
 
 
@@ -228,7 +229,10 @@ class RespectsFreeSpace:
 
 
 class WithinReach:
-    """A camera of finite speed can have come no farther since it was last tracked."""
+    """A camera of finite speed can have come no farther since it was last tracked.
+
+    Before anything is known of its speed, features may show that it is faster: a log of a vehicle may begin in motion.
+    """
 
     def judge(
         self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
@@ -241,10 +245,19 @@ class WithinReach:
             candidate: whose registration ended well.
         """
         limits, keyframe = state.config.tracking.failure, state.keyframes[candidate.keyframe_index]
-        elapsed_s = max(state.elapsed_s(frame.stamp_ns), 0.0)
         moved_m, _ = from_prediction(state, frame, candidate)
-        reach_m = (limits.max_speed_m_s * elapsed_s + limits.slack_m) * reach_factor(keyframe.median_depth_m)
-        return Reason.OBSTRUCTED if moved_m > reach_m else candidate
+        reach_m = farthest_m(state, state.elapsed_s(frame.stamp_ns), keyframe, slack_m=limits.slack_m)
+        if moved_m <= reach_m or self._shows_its_speed(state, frame, candidate):
+            return candidate
+        return Reason.OBSTRUCTED
+
+    @staticmethod
+    def _shows_its_speed(state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate) -> bool:
+        """Whether it is the first frame after one whose velocity is not known, and most features are there."""
+        if state.lost or len(state.recent) > 1:
+            return False
+        first, T = state.keyframes[candidate.keyframe_index].features, candidate.result.T_reference_target
+        return features_agree(first, frame.features, T, state.config.keyframes.judgment)
 
 
 def _features_prefer(T: Array, T_other: Array, keyframe: TrackedKeyframe, frame: CurrentFrame) -> bool:

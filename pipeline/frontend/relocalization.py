@@ -13,6 +13,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.feature_checks import farthest_m
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.matching_keyframes import most_matching
 from duagc.pipeline.frontend.nearby_registration import register_nearby
@@ -20,7 +21,6 @@ from duagc.pipeline.frontend.pose_checks import FOUND_AGAIN, DoesNotFollowMovedT
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.feature_motion import motion_from_features
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.place_index import PlaceIndex
@@ -137,8 +137,7 @@ class Relocalizer:
         index, last = before.candidate.keyframe_index, before.candidate.result.T_reference_target
         tracking = state.config.tracking
         elapsed_s = (frame.stamp_ns - before.stamp_ns) * 1e-9
-        reach_m = tracking.failure.max_speed_m_s * elapsed_s
-        reach_m *= reach_factor(state.keyframes[index].median_depth_m)
+        reach_m = farthest_m(state, elapsed_s, state.keyframes[index])
         candidate = None
         for start in _starts(state, frame, index, last):
             result = register_until_stable(

@@ -49,3 +49,29 @@ def test_a_camera_that_was_covered_is_found_by_the_second_frame(run: Undisturbed
 
 def test_a_frame_without_depth_is_followed_by_its_color(run: Undisturbed) -> None:
     assert all(followed(run, far(run, 20, no_depth=range(9, 10))))
+
+
+VEHICLE_FACTOR, VEHICLE_STEP, VEHICLE_FRAMES = 4.0, 8, 11  # surfaces 16 m away, frames 70 cm apart
+VEHICLE_NS = 33_333_333
+
+
+def test_a_log_of_a_vehicle_may_begin_in_motion(run: Undisturbed) -> None:
+    """At 21 m/s, as nobody carries a camera; covered for two frames, it is found 2 m farther on."""
+    tracker, covered = Tracker(CAMERA, CONFIG), range(5, 7)
+    found = []
+    for k, shot in enumerate(run.shots[: VEHICLE_FRAMES * VEHICLE_STEP : VEHICLE_STEP]):
+        seen = k not in covered
+        shot = replace(
+            shot,
+            index=k,
+            stamp_ns=k * VEHICLE_NS,
+            color=shot.color * seen,
+            depth=VEHICLE_FACTOR * shot.depth * seen,
+        )
+        frame, T_map_camera = track(tracker, shot)
+        found.append(frame.status is not Status.LOST)
+        if found[-1]:
+            T_true = run.poses[VEHICLE_STEP * k].copy()
+            T_true[:3, 3] *= VEHICLE_FACTOR
+            assert se3.distance(T_true, T_map_camera)[0] < 0.005 * VEHICLE_FACTOR
+    assert found == [k not in covered for k in range(VEHICLE_FRAMES)]
