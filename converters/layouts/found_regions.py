@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 
 from duagc.converters.layouts.constant_edges import ConstantEdges
 from duagc.converters.layouts.own_body import OwnBody
-from duagc.converters.layouts.validity import BlackBorder
+from duagc.converters.layouts.validity import MOVED, BlackBorder
 from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry.lens import Maps, rectified
 from duagc.pipeline.geometry.masks import Mask
 
 EVERY, EVERY_NS = 8, 250_000_000  # a frame of so many is looked at, and one in so long a time
+LESS = 0.5  # of the change of color of the scene: what a body that is reflecting, or shakes, may have
 EVERY_OF_FIRST, MANY = 3, 32  # of the first frames more are looked at, so that short recordings tell
 
 
@@ -55,7 +56,7 @@ class FoundRegions:
         Args:
             valid: bool [h, w], pixels that show the scene by all that is known; None: all.
         """
-        found = {"black": self._black.result(valid), "body": self._body.result()}
+        found = {"black": self._black.result(valid), "body": self._body_mask()}
         masks = {name: mask for name, mask in found.items() if mask is not None}
         spread = self._body.spread()
         if spread is not None and self._black.moved():
@@ -63,6 +64,17 @@ class FoundRegions:
             drawn = self._edges.result(~np.logical_and.reduce(known) if known else None, spread)
             masks |= {} if drawn is None else {"drawn": drawn}
         return masks
+
+    def _body_mask(self) -> Mask | None:
+        """Pixels [h, w] that show no body: of one that leaves most of the view, or one that keeps its color, too."""
+        shown, (pieces, moved) = self._body.result(), self._body.pieces()
+        change = 0.0 if moved is None else self._black.change_of(moved)
+        if change <= MOVED:
+            return shown
+        limit = max(MOVED, LESS * change)
+        masks = [~piece for piece in pieces if self._black.change_of(piece) <= limit]
+        masks += [] if shown is None else [shown]
+        return np.logical_and.reduce(masks) if masks else None
 
     def _value(self, color: bytes) -> NDArray[np.uint8] | None:
         """The brightest of the three colors, [h, w], as the recording's camera sees it; None: it cannot be read."""

@@ -18,6 +18,7 @@ STILL, MOVED = (
 KNOWN = 0.8  # share of the images in which a pixel of the body has a depth
 STEP = 1.15  # how many times as far what is next to the body is, or it may be a floor that the camera moves along
 NEXT_TO = 5  # pixels of the reduced image
+LEAST_MOVED = 0.25  # share of what is no body whose depth must change
 LEAST_SHARE = 0.005  # of the pixels, in pieces that touch the border
 GROW = 2  # pixels of the reduced image: the outline of what is near is blurred
 Stack = NDArray[np.floating]
@@ -28,6 +29,9 @@ class OwnBody:
 
     A floor keeps its depth too, where the camera moves along it. But it goes on, as its plane does, where the body has
     an edge, with the scene some way behind it.
+
+    A body that fills most of the view leaves little that could change, and a floor next to it keeps its depth as well.
+    `pieces` are what may be such a body, or something long that the camera moves along: color shows which.
     """
 
     def __init__(self) -> None:
@@ -64,10 +68,13 @@ class OwnBody:
         None where the camera stood still, or too few images can tell.
         """
         found = self._measured()
-        return None if found is None else self._enlarged(found[2])
+        return None if found is None or not _most_moves(*found) else self._enlarged(found[2])
 
     def _measured(self) -> tuple[Stack, Stack, Stack] | None:
-        """Share of the images in which a pixel has a depth, its median, and its spread over that; None as `spread`."""
+        """Share of the images in which a pixel has a depth, its median, and its spread over that.
+
+        None where too few images can tell.
+        """
         if len(self._images) < LEAST_IMAGES:
             return None
         if self._found is None:
@@ -75,9 +82,6 @@ class OwnBody:
             known = (depth > 0).mean(axis=0)
             low, middle, high = percentiles(np.where(depth > 0, depth, np.float32(np.nan)))
             self._found = known, middle, (high - low) / middle
-        often = self._found[0] > 0.5
-        if not often.any() or np.median(self._found[2][often]) < MOVED:
-            return None
         return self._found
 
     def _enlarged(self, reduced: NDArray[Any]) -> NDArray[Any]:
@@ -92,20 +96,71 @@ class OwnBody:
         """Pixels that show no body, bool [h, w]; None where none is seen, or the images cannot tell."""
         from scipy import ndimage
 
-        if (measured := self._measured()) is None:
+        if (measured := self._measured()) is None or not _most_moves(*measured):
             return None
         known, middle, spread = measured
         still = (known >= KNOWN) & (spread < STILL)
         # the rim that undistortion leaves has no depth
         labels, _ = ndimage.label(still | (known == 0), np.ones((3, 3)))
         found = np.zeros_like(still)
-        for label in np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])):
+        for label in np.unique(_at_border(labels)):
             piece = still & (labels == label)
             if np.count_nonzero(piece) >= LEAST_SHARE * still.size:
                 found |= _with_edge(piece, middle)
         if not found.any():
             return None
         return ~self._enlarged(ndimage.binary_dilation(found, np.ones((3, 3)), GROW))
+
+    def pieces(self) -> tuple[list[Mask], Mask | None]:
+        """Large pieces at the border, bool [h, w] each, that keep their depth and end at an edge.
+
+        What is behind the edge may keep its depth, too, as a floor does. Besides, where depth changes; None: nowhere.
+        """
+        from scipy import ndimage
+
+        if (measured := self._measured()) is None:
+            return [], None
+        known, middle, spread = measured
+        still, square = (known >= KNOWN) & (spread < STILL), np.ones((3, 3))
+        others = (known > 0.5) & ~still
+        changes = others & (spread >= MOVED)
+        if np.count_nonzero(changes) <= LEAST_MOVED * np.count_nonzero(others):
+            return [], None
+        unknown, _ = ndimage.label(known == 0, square)
+        outside = np.pad(np.isin(unknown, np.setdiff1d(_at_border(unknown), 0)), 1, constant_values=True)
+        outside = ndimage.binary_dilation(outside, square, GROW)[1:-1, 1:-1]
+        labels, _ = ndimage.label(still & ~_steps(middle), square)
+        sizes, out = np.bincount(labels.ravel()), []
+        for label in np.setdiff1d(np.unique(labels[outside]), 0):
+            piece = labels == label
+            if sizes[label] >= LEAST_SHARE * still.size and _with_edge(piece, middle).any():
+                out.append(self._enlarged(ndimage.binary_dilation(piece, square, GROW)))
+        return out, self._enlarged(changes)
+
+
+def _most_moves(known: Stack, _: Stack, spread: Stack) -> bool:
+    """Whether the depth of most pixels changes; shares of the images with a depth, medians, spreads."""
+    often = known > 0.5
+    return bool(often.any() and np.median(spread[often]) >= MOVED)
+
+
+def _at_border(image: NDArray[Any]) -> NDArray[Any]:
+    """The values along the border of an image."""
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+
+
+def _steps(middle: Stack) -> Mask:
+    """Pixels next to which depth is `STEP` times as large or as small."""
+    out = np.zeros(middle.shape, bool)
+    for here, there in (
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+    ):
+        one, other = middle[here], middle[there]
+        step = np.maximum(one, other) >= STEP * np.minimum(one, other)  # False where one is not known
+        out[here] |= step
+        out[there] |= step
+    return out
 
 
 def percentiles(depth: Stack) -> Stack:

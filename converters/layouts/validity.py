@@ -29,6 +29,7 @@ LEAST_BLACK = 0.002  # of the pixels, in pieces that touch the border
 GROW_PX = 4  # a vignette does not end from one pixel to the next
 # side and number of the small images by which it is seen whether the camera moved
 SMALL_PX, MOST_SMALL = 24, 256
+MOST = 0.5  # of a pixel of these: then it counts as one of some that are asked for
 MOVED = 0.25
 """Change of the median pixel that is not black, in standard deviations of the image, from which on the camera moved.
 
@@ -102,16 +103,29 @@ class BlackBorder:
 
     def moved(self) -> bool:
         """Whether what is not black changed, by more than exposure."""
+        return self.change_of(np.ones((SMALL_PX, SMALL_PX), dtype=bool)) > MOVED
+
+    def change_of(self, pixels: Mask) -> float:
+        """By how much those of some pixels that are not black changed, as a rule, in standard deviations of the image.
+
+        Args:
+            pixels: bool [h, w], some of those of the images.
+        """
+        import cv2
+
         if not self._small:
-            return False
+            return 0.0
         images = np.stack(self._small)
-        lit = images[:, images.max(axis=0) > 2 * BLACK]
-        if not lit.size:
-            return False
+        is_lit = images.max(axis=0) > 2 * BLACK
+        size, share = (SMALL_PX, SMALL_PX), pixels.astype(np.float32)
+        chosen = (np.asarray(cv2.resize(share, size, interpolation=cv2.INTER_AREA)) > MOST)[is_lit]
+        if not chosen.any():
+            return 0.0
+        lit = images[:, is_lit]
         lit = lit - lit.mean(axis=1, keepdims=True)
         lit /= np.maximum(lit.std(axis=1, keepdims=True), 1)
         low, high = np.percentile(lit, (25, 75), axis=0)  # who walks through is seen in few images
-        return bool(np.median(high - low) > MOVED)
+        return float(np.median((high - low)[chosen]))
 
 
 # --- what users say -------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from duagc.converters.layouts.found_regions import FoundRegions
 from duagc.converters.layouts.own_body import LEAST_IMAGES, MOST_IMAGES, OwnBody, percentiles
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -128,3 +129,39 @@ def test_percentiles_are_those_of_every_pixel_alone() -> None:
     depth[:, 0, :3] = np.nan
     depth[1:, 1, 0] = np.nan
     np.testing.assert_array_equal(percentiles(depth), np.nanpercentile(depth, [10, 50, 90], axis=0))
+
+
+CABIN = np.zeros((HEIGHT, WIDTH), bool)
+CABIN[:6] = CABIN[36:] = CABIN[:, :16] = CABIN[:, 66:] = True
+
+
+def driven(k: int) -> NDArray[np.float64]:
+    """What a vehicle sees beyond its cabin: a road, whose depth stays, and above it the scene."""
+    v = np.arange(HEIGHT)[:, None]
+    return np.where(v > 28, 1500 * 60 / np.maximum(v - 20, 1), 5 * scene(k))
+
+
+def shown_by(
+    images: list[NDArray[np.float64]], colors: list[NDArray[np.uint8]]
+) -> dict[str, NDArray[np.bool_]]:
+    regions, rng = FoundRegions(), np.random.default_rng(0)
+    for k, (image, color) in enumerate(zip(images, colors, strict=True)):
+        depth = (image * (1 + 0.004 * rng.standard_normal(image.shape))).astype(np.uint16)
+        regions.add(3 * k + 1, 10**9 * k, cv2.imencode(".png", color)[1].tobytes(), depth)
+    return regions.result(None)
+
+
+def test_a_cabin_that_fills_most_of_the_view_is_found_in_front_of_a_road() -> None:
+    rng = np.random.default_rng(1)
+    still = rng.integers(30, 220, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    coarse = [rng.integers(30, 220, (6, 8, 3), dtype=np.uint8) for _ in range(24)]
+    passing = [cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR) for image in coarse]
+    images = [np.where(CABIN, 600.0, driven(k)) for k in range(24)]
+    assert CABIN.mean() > 0.6
+    shows = shown_by(images, [np.where(CABIN[..., None], still, image) for image in passing])["body"]
+    assert not shows[CABIN].any()
+    assert np.count_nonzero(~shows) < 1.25 * np.count_nonzero(CABIN)
+    # a wall that a robot drives along keeps its depth, too, but its color passes
+    assert "body" not in shown_by(images, passing)
+    # and a camera that stands still sees nothing else change
+    assert "body" not in shown_by(images[:1] * 24, passing[:1] * 24)
