@@ -17,7 +17,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Level, Reference, RegistrationConfig, RgbdPyramid, register
-from duagc.pipeline.registration.features import Features, matches
+from duagc.pipeline.registration.features import Features, count_matches
 from tests.fixtures.room import pose, render
 
 CAMERA = PinholeCamera(320, 240, 220.0, 220.0, 159.5, 119.5)
@@ -200,7 +200,7 @@ def test_loops_are_looked_for_among_a_bounded_number(circle: Walk, monkeypatch: 
     poses = np.concatenate([start[:1], np.repeat(start[1:2], 40, axis=0), start[16:]])
     images = {0: circle.pyramids[0], 41: circle.pyramids[16]}
     compared = []
-    monkeypatch.setattr(loops, "matches", lambda *a: compared.append(a) or matches(*a))
+    monkeypatch.setattr(loops, "count_matches", lambda *a: compared.append(a) or count_matches(*a))
     config = LoopConfig(compared=3, min_matches=60)
     found = find_loops(
         poses, views, lambda k, _: images[k], config=config, registration=REGISTRATION, seed=0, robot="alpha"
