@@ -4,7 +4,7 @@ import fcntl
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from duagc.pipeline.base.errors import DuagError
@@ -35,18 +35,14 @@ def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) 
         out = out.resolve()  # renaming would move the link
     partial, replaced = (out.with_name(out.name + ending) for ending in (".part", ".replaced.part"))
     with _locked(partial):
-        try:
-            _settle(replaced, out)
-            _check_out(out, force, kind)
-            yield partial
-            _check_out(out, force, kind)  # it may have appeared meanwhile
-            if out.exists():
-                out.rename(replaced)  # removing takes long: whoever is stopped in it leaves one whole folder
-            partial.rename(out)
-            _settle(replaced, out)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
+        _settle(replaced, out)
+        _check_out(out, force, kind)
+        yield partial
+        _check_out(out, force, kind)  # it may have appeared meanwhile
+        if out.exists():
+            out.rename(replaced)  # removing takes long: whoever is stopped in it leaves one whole folder
+        partial.rename(out)
+        _settle(replaced, out)
 
 
 def check_apart(out: Path, inputs: Sequence[Path]) -> None:
@@ -107,6 +103,9 @@ def _locked(folder: Path) -> Iterator[None]:
             else:
                 path.unlink()
         yield
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
     finally:
         os.close(lock)
 
@@ -117,18 +116,37 @@ def _lock_of(folder: Path) -> int:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             lock = _opened(folder)
+            if lock is not None and _is_taken(lock, folder):
+                return lock
         except OSError as error:
             raise DuagError(f"{folder}: {error.strerror or error}, expected to write a folder") from error
-        if lock is None:
-            continue
+        except KeyboardInterrupt:
+            _remove_unlocked(folder)
+            raise
+
+
+def _is_taken(lock: int, folder: Path) -> bool:
+    """Lock a folder that was opened; if it has lost its name meanwhile, close it."""
+    try:
+        _take(lock, folder)
+        if _is_named(lock, folder):
+            return True
+    except BaseException:
+        os.close(lock)
+        raise
+    os.close(lock)
+    return False
+
+
+def _remove_unlocked(folder: Path) -> None:
+    """Remove a folder, if it is empty and no process writes it."""
+    with suppress(OSError, DuagError):
+        lock = os.open(folder, os.O_RDONLY)
         try:
             _take(lock, folder)
-            if _is_named(lock, folder):
-                return lock
-        except BaseException:
+            folder.rmdir()
+        finally:
             os.close(lock)
-            raise
-        os.close(lock)
 
 
 def _opened(folder: Path) -> int | None:

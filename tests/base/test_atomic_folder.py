@@ -140,3 +140,33 @@ def test_a_folder_whose_owner_ends_while_it_is_locked_is_not_taken_for_a_new_one
         write(out, "new")
         assert content(out) == {"manifest.json": "new", "fused.mcap": "new"}
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("begun", ["_opened", "_is_named", "_settle"])
+def test_what_is_stopped_before_its_work_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun: str
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic_folder, begun, stopped)
+    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "out", force=False):
+        raise AssertionError("the work began")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_stopped_leaves_the_folder_that_another_process_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with new_folder(tmp_path / "out", force=False) as folder:
+        is_taken = atomic_folder._is_taken
+
+        def stopped(*of: object) -> None:
+            monkeypatch.setattr(atomic_folder, "_is_taken", is_taken)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(atomic_folder, "_is_taken", stopped)
+        with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "out", force=False):
+            raise AssertionError("the work began")
+        (folder / "a").write_text("a")
+    assert (tmp_path / "out" / "a").is_file()
