@@ -22,12 +22,13 @@ from duagc.pipeline.recording.names import DEPTH_SCALE_KEY, RANGE_SIGMA_KEY
 from duagc.pipeline.recording.pairing import pair_topics
 from duagc.pipeline.recording.read import LogFile, Record
 from duagc.pipeline.recording.register_depth import register_depth
+from duagc.pipeline.recording.sparse_depth import between_pixels, is_sparse
 from duagc.schemas import topics as topic_table
 
 Value = TypeVar("Value")
 
-STEP_IMAGES = 5
-"""Depth images, spread over the log, in which the steps of a sensor are looked for."""
+SOME_IMAGES = 5
+"""Depth images, spread over the log, that say whether a sensor measures in steps, or in few pixels."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class Registered:
         """
         self.topic, self.camera = topic_table.DEPTH.of(robot), camera
         self.scale = _meters(log, self.topic, DEPTH_SCALE_KEY)
-        self._steps = _Steps(log, self.topic, self.scale, camera, robot=robot)
+        self._surfaces = _Surfaces(log, self.topic, self.scale, camera, robot=robot)
         self._log, self._sigma_topic = log, topic_table.DEPTH_SIGMA.of(robot)
         self._sigma_at = log.entries_by_time(self._sigma_topic)
         if self._sigma_at:
@@ -114,7 +115,7 @@ class Registered:
             DuagError: the message cannot be read, has another size, or lacks the image of its standard
                 deviation.
         """
-        depth_m = self._steps.smoothed(_depth_image(record, self.scale, self.camera))
+        depth_m = self._surfaces.of(_depth_image(record, self.scale, self.camera))
         if not self._sigma_at:
             return DepthImage(depth_m)
         entry = self._sigma_at.get(record.publish_time_ns)
@@ -147,7 +148,7 @@ class OtherCamera:
         self.depth_camera = constant(log, calibration, messages.unpack_calibration)
         transform = topic_table.RAW_DEPTH_TRANSFORM.of(robot)
         self.T_camera_depth = np.array(constant(log, transform, transform_rows))
-        self._steps = _Steps(log, self.topic, self.scale, self.depth_camera, robot=robot)
+        self._surfaces = _Surfaces(log, self.topic, self.scale, self.depth_camera, robot=robot)
 
     def read(self, record: Record) -> DepthImage:
         """The depth image of a message, moved into the color camera.
@@ -158,7 +159,7 @@ class OtherCamera:
         Raises:
             DuagError: the message cannot be read, or has another size than the depth camera.
         """
-        depth_m = self._steps.smoothed(_depth_image(record, self.scale, self.depth_camera))
+        depth_m = self._surfaces.of(_depth_image(record, self.scale, self.depth_camera))
         return DepthImage(register_depth(depth_m, self.depth_camera, self.T_camera_depth, self.camera))
 
 
@@ -199,26 +200,36 @@ class Lidar:
         return DepthImage(depth_m, sigma_m if range_sigma_m else None)
 
 
-class _Steps:
-    """Takes the steps out of the depth images of a topic, where they are coarse; found in some of its images."""
+class _Surfaces:
+    """Makes surfaces of the depth images of a topic where they are steps or single pixels, as some of them are."""
 
     def __init__(self, log: LogFile, topic: str, scale: float, camera: PinholeCamera, *, robot: str) -> None:
         self._log, self._topic, self._color_topic = log, topic, topic_table.COLOR.of(robot)
         self._scale, self._camera = scale, camera
 
     @cached_property
-    def _step_per_m(self) -> float:
+    def _kind(self) -> tuple[bool, float]:
+        """Whether single pixels are known; and the step of inverse depth, 1/m."""
         at = self._log.entries_by_time(self._topic)
         frames = pair_topics(self._log, self._color_topic, self._topic).pairs
         held_out = {depth for index, (_, depth) in enumerate(frames) if is_held_out(index)}
         mapped = [entry for stamp, entry in sorted(at.items()) if stamp not in held_out]
-        some = [mapped[k] for k in evenly_spaced(len(mapped), min(STEP_IMAGES, len(mapped)))]
+        some = [mapped[k] for k in evenly_spaced(len(mapped), min(SOME_IMAGES, len(mapped)))]
         records = [self._log.record_at(self._topic, entry) for entry in some]
-        return inverse_step_per_m([_depth_image(r, self._scale, self._camera) for r in records], self._scale)
+        depths_m = [_depth_image(r, self._scale, self._camera) for r in records]
+        sparse = 2 * sum(is_sparse(depth_m) for depth_m in depths_m) > len(depths_m)
+        return sparse, inverse_step_per_m(depths_m, self._scale)
 
-    def smoothed(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A depth image as it is, or without steps if they are coarse."""
-        return without_steps(depth_m, self._step_per_m) if self._step_per_m >= COARSE_PER_M else depth_m
+    def of(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A depth image as it is, or without steps if they are coarse, and known between single pixels.
+
+        Args:
+            depth_m: as it was read.
+        """
+        sparse, step_per_m = self._kind
+        if sparse:
+            return between_pixels(depth_m, self._camera)
+        return without_steps(depth_m, step_per_m) if step_per_m >= COARSE_PER_M else depth_m
 
 
 def constant(log: LogFile, topic: str, unpack: Callable[[Any], Value]) -> Value:

@@ -18,8 +18,8 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
+from duagc.pipeline.geometry.scattered_holes import without_scattered_holes
 from duagc.pipeline.kernels import pyramid as compiled
-from duagc.pipeline.registration.scattered_holes import without_scattered_holes
 
 Image = NDArray[Any]
 

@@ -111,8 +111,8 @@ def test_images_of_held_out_frames_say_nothing_of_steps(
     monkeypatch.setattr(depth_sources, "_depth_image", lambda *_: np.ones((4, 4), np.float32))
     camera = PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5)
     monkeypatch.setattr(depth_sources, "pair_topics", lambda log, *of: pair(*map(log.entries_by_time, of), 0))
-    steps = depth_sources._Steps(Log(), "depth", 0.001, camera, robot="alpha")
-    steps.smoothed(np.ones((4, 4), np.float32))
+    surfaces = depth_sources._Surfaces(Log(), "depth", 0.001, camera, robot="alpha")
+    surfaces.of(np.ones((4, 4), np.float32))
     mapped = [k for k in range(images) if k % 8 != 4 and k not in dropped]
-    assert len(looked_at) == min(depth_sources.STEP_IMAGES, len(mapped))
+    assert len(looked_at) == min(depth_sources.SOME_IMAGES, len(mapped))
     assert not any(is_held_out(k) for k in looked_at)

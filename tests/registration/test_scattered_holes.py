@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.scattered_holes import without_scattered_holes
 from duagc.pipeline.registration import Reference, RgbdPyramid, register
-from duagc.pipeline.registration.scattered_holes import without_scattered_holes
 from tests.fixtures.room import CAMERA, pose, render
 
 SIZE = 96, 128

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import masks
-from duagc.pipeline.registration.definition import SAME_SURFACE
 
 Image: TypeAlias = NDArray[np.float32]
 
@@ -21,6 +20,7 @@ LEAST_WHOLE = 0.7
 """Share of the known pixels with eight known neighbors below which holes are scattered: dense depth has 0.95 and more,
 with holes of many pixels in half of the image 0.8; with every twentieth pixel missing 0.66."""
 ROUNDS = 5
+SAME_SURFACE = np.float32(0.05)  # relative difference of depth up to which neighbors count as one surface
 
 
 def without_scattered_holes(inverse_depth: Image, mask: masks.Mask | None) -> Image:
@@ -33,7 +33,7 @@ def without_scattered_holes(inverse_depth: Image, mask: masks.Mask | None) -> Im
         inverse_depth: [h, w], 1/m, 0 where unknown.
         mask: bool [h, w], pixels that may be used; None: all.
     """
-    if not _are_scattered(inverse_depth):
+    if not holes_are_scattered(inverse_depth):
         return inverse_depth
     filled = inverse_depth.copy()
     values, width = filled.reshape(-1), filled.shape[1]
@@ -47,8 +47,12 @@ def without_scattered_holes(inverse_depth: Image, mask: masks.Mask | None) -> Im
     return filled
 
 
-def _are_scattered(inverse_depth: Image) -> bool:
-    """Whether few of the known pixels of an image [h, w] have only known neighbors."""
+def holes_are_scattered(inverse_depth: Image) -> bool:
+    """Whether few of the known pixels of an image have only known neighbors.
+
+    Args:
+        inverse_depth: [h, w], 1/m, 0 where unknown.
+    """
     known = inverse_depth > 0
     rows = known[:, :-2] & known[:, 1:-1] & known[:, 2:]
     whole = rows[:-2] & rows[1:-1] & rows[2:]
