@@ -228,11 +228,12 @@ def _say_times(run_folder: Path) -> None:
 def _say_advice(run_folder: Path, recording: Path) -> None:
     from duagc.pipeline.evaluation.network import Session
     from duagc.pipeline.recording import Recording
-    from duagc.pipeline.report.advice import advice
+    from duagc.pipeline.report.advice import advice, joining_advice
     from duagc.pipeline.runs.folder import RunFolder
 
     run = RunFolder(run_folder)
-    for said in advice(run, Recording(recording), Session(run)) if run.metrics else []:
+    measured = advice(run, Recording(recording), Session(run)) if run.metrics else [joining_advice(run)]
+    for said in filter(None, measured):
         say(said)
 
 

@@ -137,7 +137,7 @@ def run_session_of(
             _Recorder(packets, rounds, watch),
             period_ns=config.period_ns,
             max_rounds=config.max_rounds,
-            title="exchange",
+            title="rounds of the exchange",
         )
         now_ns = (count - 1) * config.period_ns
         results = {robot: result_of(agent) for robot, agent in agents.items()}

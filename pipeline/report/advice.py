@@ -30,12 +30,31 @@ def advice(run: RunFolder, source: Recording, session: Session) -> list[str]:
         session: the exchange of the run.
     """
     said = (
+        joining_advice(run),
         calibration_advice(run, source),
         depth_scale_advice(run),
         moved_advice(session),
         truth_advice(run),
     )
     return [sentence for sentence in said if sentence]
+
+
+def joining_advice(run: RunFolder) -> str:
+    """A sentence that names the maps that were not joined; "" where all are in one frame.
+
+    Args:
+        run: a finished one, measured or not.
+    """
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for name, robot in run.robots.items():
+        groups.setdefault(robot.component, []).append(name)
+    if len(groups) < 2:
+        return ""
+    apart = "; ".join(", ".join(names) for names in groups.values())
+    return (
+        f"Not in one frame of the world: {apart}. No loop closures that hold join them; "
+        "`duagc inspect --loop-closures` says why."
+    )
 
 
 def calibration_advice(run: RunFolder, source: Recording) -> str:

@@ -13,6 +13,7 @@ from duagc.pipeline.report.advice import (
     FEWEST_PAIRS,
     calibration_advice,
     depth_scale_advice,
+    joining_advice,
     moved_advice,
     truth_advice,
 )
@@ -103,3 +104,12 @@ def test_robots_between_whose_views_something_moved_are_named() -> None:
     assert "the views of alpha and bravo (3)" in said
     assert "charlie" not in said
     assert moved_advice(SimpleNamespace(loop_closures=decisions[3:])) == ""
+
+
+def test_maps_that_were_not_joined_are_named() -> None:
+    components = {"alpha": ("alpha", "bravo"), "alpha-2": ("alpha-2",), "bravo": ("alpha", "bravo")}
+    robots = {name: SimpleNamespace(component=names) for name, names in components.items()}
+    run: Any = SimpleNamespace(robots=robots)
+    assert "Not in one frame of the world: alpha, bravo; alpha-2." in joining_advice(run)
+    del robots["alpha-2"]
+    assert joining_advice(run) == ""
