@@ -8,6 +8,7 @@ changes no other: nothing was built on it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
 
 import numpy as np
@@ -19,10 +20,11 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.current_frame import features_of
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
+from duagc.pipeline.frontend.feature_checks import FASTER
 from duagc.pipeline.frontend.judgment import contradicts
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.submaps import lost
-from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe, tracked_path
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.align import reach_factor
@@ -64,11 +66,11 @@ def without_jumps(
         config: of the front end.
     """
 
+    reach = _Reach.of(frames, T_map_keyframes, config)
+
     def reaches(one: TrackedFrame, other: TrackedFrame) -> bool:
         T, seen_m = T_map_keyframes[one.keyframe_index], keyframes[one.keyframe_index].median_depth_m
-        return _within_reach(
-            one, T @ one.T_keyframe_camera, other, T_map_keyframes, seen_m=seen_m, config=config
-        )
+        return reach.holds(one, T @ one.T_keyframe_camera, other, seen_m)
 
     posed = [k for k, frame in enumerate(frames) if frame.status is not Status.LOST]
     out, made = list(frames), {keyframe.frame_index for keyframe in keyframes}
@@ -106,8 +108,9 @@ def found_afterwards(
         return list(frames)
     posed = [k for k, frame in enumerate(frames) if frame.status is not Status.LOST]
     done, out = checkpoints.resume(part) or (0, list(frames))
+    reach = _Reach.of(frames, T_map_keyframes, config)
     for k in range(done, len(frames)):
-        found = _found(k, frames, keyframes, T_map_keyframes, posed=posed, images=images, config=config)
+        found = _found(k, frames, keyframes, reach, posed=posed, images=images, config=config)
         out[k] = found or out[k]
         checkpoints.at(part, k + 1, len(frames), lambda: out)
     return out
@@ -152,7 +155,7 @@ def _found(
     k: int,
     frames: Sequence[TrackedFrame],
     keyframes: Sequence[TrackedKeyframe],
-    T_map_keyframes: Array,
+    reach: _Reach,
     *,
     posed: Sequence[int],
     images: Images,
@@ -166,12 +169,8 @@ def _found(
     near = _anchors(frames, posed, after, config.tracking.relocalization.look_again_keyframes)
     pyramid = images(frame.frame_index, len(config.tracking.strides))
     for keyframe, result in _registrations(frame, pyramid, [keyframes[n] for n in near], config):
-        T_map_camera = T_map_keyframes[keyframe.keyframe_index] @ result.T_reference_target
-        seen_m = keyframe.median_depth_m
-        if all(
-            _within_reach(frame, T_map_camera, other, T_map_keyframes, seen_m=seen_m, config=config)
-            for other in around
-        ):
+        T_map_camera = reach.T_map_keyframes[keyframe.keyframe_index] @ result.T_reference_target
+        if all(reach.holds(frame, T_map_camera, other, keyframe.median_depth_m) for other in around):
             return _relocalized(frame, keyframe, result)
     return None
 
@@ -242,18 +241,40 @@ def _confirmed(
     return found is None or not contradicts(found, limits)
 
 
-def _within_reach(
-    frame: TrackedFrame,
-    T_map_camera: Array,
-    other: TrackedFrame,
-    T_map_keyframes: Array,
-    *,
-    seen_m: float,
-    config: FrontendConfig,
-) -> bool:
-    """Whether a camera of finite speed can have been at two places at the times of two frames."""
-    limits = config.tracking.failure
-    T_map_other = T_map_keyframes[other.keyframe_index] @ other.T_keyframe_camera
-    elapsed_s = abs(frame.stamp_ns - other.stamp_ns) * 1e-9
-    moved_m = float(se3.distance(T_map_camera, T_map_other)[0])
-    return moved_m <= (limits.max_speed_m_s * elapsed_s + limits.slack_m) * reach_factor(seen_m)
+@dataclass(frozen=True)
+class _Reach:
+    """How far a camera can have come between two frames.
+
+    Attributes:
+        T_map_keyframes: [k, 4, 4].
+        speed_m_s: with which it may move.
+        slack_m: what it may be off besides.
+    """
+
+    T_map_keyframes: Array
+    speed_m_s: float
+    slack_m: float
+
+    @staticmethod
+    def of(frames: Sequence[TrackedFrame], T_map_keyframes: Array, config: FrontendConfig) -> _Reach:
+        """By the speed that cameras have, or twice that of most frames that were followed: vehicles are faster."""
+        limits = config.tracking.failure
+        path = tracked_path(frames, T_map_keyframes)
+        moved_m = np.linalg.norm(np.diff(path.poses[:, :3, 3], axis=0), axis=1)
+        elapsed_s = 1e-9 * np.diff(path.stamps_ns)
+        usual_m_s = float(np.median(moved_m / np.maximum(elapsed_s, 1e-9))) if len(moved_m) else 0.0
+        return _Reach(T_map_keyframes, max(limits.max_speed_m_s, FASTER * usual_m_s), limits.slack_m)
+
+    def holds(self, frame: TrackedFrame, T_map_camera: Array, other: TrackedFrame, seen_m: float) -> bool:
+        """Whether a camera can have been at two places at the times of two frames.
+
+        Args:
+            frame: one of them.
+            T_map_camera: [4, 4], its pose.
+            other: the other, which has a pose.
+            seen_m: what the first sees is so far, in the median.
+        """
+        T_map_other = self.T_map_keyframes[other.keyframe_index] @ other.T_keyframe_camera
+        elapsed_s = abs(frame.stamp_ns - other.stamp_ns) * 1e-9
+        moved_m = float(se3.distance(T_map_camera, T_map_other)[0])
+        return moved_m <= (self.speed_m_s * elapsed_s + self.slack_m) * reach_factor(seen_m)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
+from duagc.pipeline.frontend import lost_frames
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.lost_frames import found_afterwards, without_jumps
 from duagc.pipeline.frontend.submaps import lost
@@ -52,6 +54,19 @@ def test_a_lost_frame_is_found_between_its_neighbors(run: Undisturbed) -> None:
     moved_m, turned_rad = se3.distance(T_map_keyframe @ found[LOST].T_keyframe_camera, run.poses[LOST])
     assert moved_m < 0.003
     assert turned_rad < 0.002
+
+
+def test_a_lost_frame_of_a_vehicle_is_found_between_its_neighbors(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every twelfth frame of a film ten times as fast: 30 cm from one to the next, at 8 m/s."""
+    frames = [
+        replace(f, stamp_ns=f.stamp_ns // 10)
+        for f in with_loss(run, LOST, Reason.UNCONFIRMED)[LOST % 12 :: 12]
+    ]
+    assert looked_for(run, frames, {})[LOST // 12].status is Status.RELOCALIZED
+    monkeypatch.setattr(lost_frames, "FASTER", 0.0)
+    assert looked_for(run, frames, {}) == frames, "of what is carried by hand"
 
 
 def test_a_frame_that_jumps_away_and_back_is_lost(run: Undisturbed) -> None:
