@@ -267,6 +267,9 @@ class MotionReader:
                 f"the first at {at_s:.3f} s; left out"
             )
         times, values = times[sound], values[sound]
+        if not len(values):
+            self.warnings.append(f"{topic}: no message; left out")
+            return None
         if not values[:, :3].any():
             self.warnings.append(
                 f"{topic}: all turning rates are zero, as of an accelerometer alone; left out"

@@ -147,9 +147,9 @@ def _judged(candidate: Candidate, found: GeometricVerification, config: Verifica
     if found.failure is None:
         information = _certainty(found.information, config)
         closure = LoopClosure(*candidate.ends, found.T_first_second, information, alike=found.alike)
-    elif found.features.T_first_second is not None and found.features.accepted:
+    elif (T_features := found.features.accepted_motion) is not None:
         certainty = _certainty(found.features.information, config)
-        tentative = LoopClosure(*candidate.ends, found.features.T_first_second, certainty)
+        tentative = LoopClosure(*candidate.ends, T_features, certainty)
     return Verified(verdict, found.features.matches, found.features.inliers, detail, closure, tentative)
 
 

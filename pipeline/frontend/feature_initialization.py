@@ -49,7 +49,7 @@ def initial_motion(state: TrackingState, frame: CurrentFrame, keyframe_index: in
     rng = random_streams.generator(0, "initialization", frame=frame.frame_index, keyframe=keyframe_index)
     features, config = state.keyframes[keyframe_index].features, state.config.tracking.relocalization
     found = motion_from_features(features, frame.features, config, rng)
-    return found.T_first_second if found.accepted else None
+    return found.accepted_motion
 
 
 def _keyframes(state: TrackingState, frame: CurrentFrame) -> Iterator[int]:

@@ -203,12 +203,10 @@ def _registrations(
     features = features_of(pyramid, limits)
     for keyframe in keyframes:
         rng = _draws(frame, keyframe)
-        moved = motion_from_features(keyframe.features, features, limits, rng)
-        if moved.T_first_second is None or not moved.accepted:
+        moved = motion_from_features(keyframe.features, features, limits, rng).accepted_motion
+        if moved is None:
             continue
-        result = register_until_stable(
-            keyframe, pyramid, moved.T_first_second, tracking, first=tracking.registration
-        )
+        result = register_until_stable(keyframe, pyramid, moved, tracking, first=tracking.registration)
         if not result.ok or not _confirmed(keyframe, features, result, config, rng=rng):
             continue
         violations, visible = free_space_violations(

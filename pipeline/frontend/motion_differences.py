@@ -139,8 +139,8 @@ def has_sigma(log: RgbdLog) -> bool:
     Args:
         log: of the robot.
     """
-    first = next(k for k, (_, depth) in enumerate(log.pairing.pairs) if depth is not None)
-    return log.frame(first).depth_sigma is not None
+    first = next((k for k, (_, depth) in enumerate(log.pairing.pairs) if depth is not None), None)
+    return first is not None and log.frame(first).depth_sigma is not None
 
 
 def joint_information(first: Array, second: Array) -> Array:

@@ -49,9 +49,9 @@ def place_candidates(
     for k in most_matching(view, keyframes, config, among):
         # the draws only choose which samples are tried: the same in every run
         rng = random_streams.generator(0, "relocalization", frame=frame_index, keyframe=k)
-        found = motion_from_features(keyframes[k], view, config, rng)
-        if found.T_first_second is not None and found.accepted:
-            yield k, found.T_first_second
+        motion = motion_from_features(keyframes[k], view, config, rng).accepted_motion
+        if motion is not None:
+            yield k, motion
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,9 @@ def _starts(state: TrackingState, frame: CurrentFrame, keyframe_index: int, last
     # the draws only choose which samples are tried: the same in every run
     rng = random_streams.generator(0, "confirmation", frame=frame.frame_index, keyframe=keyframe_index)
     features, config = state.keyframes[keyframe_index].features, state.config.tracking.relocalization
-    moved = motion_from_features(features, frame.features, config, rng)
-    if moved.T_first_second is not None and moved.accepted:
-        yield moved.T_first_second
+    moved = motion_from_features(features, frame.features, config, rng).accepted_motion
+    if moved is not None:
+        yield moved
 
 
 def find_place(

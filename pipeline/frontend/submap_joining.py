@@ -169,9 +169,9 @@ def _verified(
         place, moved = verified.of_place, verified.of_moved
         if place.failure is None:
             closures.append(LoopClosure(i, j, place.T_first_second, place.information, alike=place.alike))
-        if place.features.T_first_second is None or not place.features.accepted:
+        if (T_features := place.features.accepted_motion) is None:
             continue
-        by_features = LoopClosure(i, j, place.features.T_first_second, place.features.information)
+        by_features = LoopClosure(i, j, T_features, place.features.information)
         if moved is not None and moved.failure is None:
             thing = LoopClosure(i, j, moved.T_first_second, moved.information)
             shown.append(TwoMotions(by_features, thing))

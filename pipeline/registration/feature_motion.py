@@ -43,6 +43,11 @@ class FeatureMotion:
         return self.T_first_second is not None and self.inliers >= self.needed
 
     @property
+    def accepted_motion(self) -> Array | None:
+        """`T_first_second`, if enough matches agree on it."""
+        return self.T_first_second if self.accepted else None
+
+    @property
     def spread_m(self) -> float:
         """Root of the mean squared distance of the points that agree from their mean."""
         return _spread_m(self.points)

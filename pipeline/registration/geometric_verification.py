@@ -170,9 +170,9 @@ def verify(
         )
     found = motion_of_points(*points, config, rng)
     verified = _verified(found, (first, second), config, registration)
-    if not both or found.T_first_second is None or not found.accepted:
+    if not both or found.accepted_motion is None:
         return verified
-    other = motion_of_others(found.T_first_second, *points, config=config, rng=rng)
+    other = motion_of_others(found.accepted_motion, *points, config=config, rng=rng)
     if other is None:
         return verified
     return replace(verified, another=_verified(other, (first, second), config, registration))
