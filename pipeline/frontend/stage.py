@@ -56,6 +56,7 @@ from duagc.pipeline.frontend.view_poses import moved_factors
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.recording import MotionPrior, RgbdFrame, RgbdLog, open_rgbd
+from duagc.pipeline.recording.depth_motion import CurveKind
 from duagc.pipeline.recording.moved_depth import DELAY_KEY
 from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.pipeline.recording.shutter import FOUND_KEY
@@ -330,7 +331,7 @@ class _ComponentStage:
                 ),
             )
         tracked = tracked_path(frames, solution.T_map_keyframe)
-        log.move_depth(tracked, kind=(kind := log.curve_kind(tracked)))
+        log.move_depth(tracked, kind=(kind := CurveKind.of(tracked, log.gyro)))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
         part = f"{self.name}.exposures"
         estimation = ExposureEstimation(self.blocks.of, self.config.exposure, save, part)
@@ -353,8 +354,7 @@ class _ComponentStage:
             "depth_without_color": str(len(log.pairing.depth_alone)),
             "depth_noise_m": "unknown" if self.noise_m is None else f"{self.noise_m:.6f}",
         }
-        if log.depth_delay_ns:
-            notes[DELAY_KEY] = str(log.depth_delay_ns)
+        notes |= {DELAY_KEY: str(log.depth_delay_ns)} if log.depth_delay_ns else {}
         if log.readout.rolls and not log.states_readout:
             notes |= log.readout.notes()
         if built.shutter_s > 0:

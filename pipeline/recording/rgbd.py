@@ -232,7 +232,8 @@ class RgbdLog:
         return motion_prior(self._log, self.robot)
 
     @cached_property
-    def _gyro(self) -> GyroPrior | None:
+    def gyro(self) -> GyroPrior | None:
+        """The gyroscope of the log; None if it has none."""
         return gyro_prior(self._log, self.robot)
 
     def motion_along(self, *parts: Trajectory) -> DepthMotion:
@@ -241,15 +242,7 @@ class RgbdLog:
         Args:
             parts: as of `move_depth`.
         """
-        return DepthMotion(*parts, gyro=self._gyro, kind=self._kind)
-
-    def curve_kind(self, part: Trajectory) -> CurveKind:
-        """The kind of curves that describes the motion along a path best.
-
-        Args:
-            part: T_map_camera of its frames.
-        """
-        return CurveKind.of(part, self._gyro)
+        return DepthMotion(*parts, gyro=self.gyro, kind=self._kind)
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Every frame in order of time."""
