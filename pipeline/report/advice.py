@@ -40,11 +40,13 @@ def advice(run: RunFolder, source: Recording, session: Session) -> list[str]:
 
 
 def joining_advice(run: RunFolder) -> str:
-    """A sentence that names the maps that were not joined; "" where all are in one frame.
+    """A sentence that names the maps that were not joined; "" where all are in one frame, or not fused yet.
 
     Args:
-        run: a finished one, measured or not.
+        run: measured or not.
     """
+    if not all((robot.folder / "fused.mcap").is_file() for robot in run.robots.values()):
+        return ""
     groups: dict[tuple[str, ...], list[str]] = {}
     for name, robot in run.robots.items():
         groups.setdefault(robot.component, []).append(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -106,10 +107,12 @@ def test_robots_between_whose_views_something_moved_are_named() -> None:
     assert moved_advice(SimpleNamespace(loop_closures=decisions[3:])) == ""
 
 
-def test_maps_that_were_not_joined_are_named() -> None:
+def test_maps_that_were_not_joined_are_named(tmp_path: Path) -> None:
     components = {"alpha": ("alpha", "bravo"), "alpha-2": ("alpha-2",), "bravo": ("alpha", "bravo")}
-    robots = {name: SimpleNamespace(component=names) for name, names in components.items()}
+    robots = {name: SimpleNamespace(component=names, folder=tmp_path) for name, names in components.items()}
     run: Any = SimpleNamespace(robots=robots)
+    assert joining_advice(run) == "", "nothing is fused yet"
+    (tmp_path / "fused.mcap").touch()
     assert "Not in one frame of the world: alpha, bravo; alpha-2." in joining_advice(run)
     del robots["alpha-2"]
     assert joining_advice(run) == ""
