@@ -157,7 +157,8 @@ def farthest_m(
 ) -> float:
     """How far the camera can have come in a time, meters.
 
-    Vehicles are faster than what is carried by hand: a camera may be twice as fast as it was when last followed.
+    Vehicles are faster than what is carried by hand: a camera may be twice as fast as its last frames came forward,
+    which one that is shaken does not.
 
     Args:
         state: what the tracker knows.
@@ -165,6 +166,5 @@ def farthest_m(
         keyframe: what it sees.
         slack_m: added to the distance.
     """
-    followed_m_s = float(np.linalg.norm(state.velocity[:3]))
-    speed_m_s = max(state.config.tracking.failure.max_speed_m_s, FASTER * followed_m_s)
+    speed_m_s = max(state.config.tracking.failure.max_speed_m_s, FASTER * state.followed_m_s)
     return (speed_m_s * max(elapsed_s, 0.0) + slack_m) * reach_factor(keyframe.median_depth_m)

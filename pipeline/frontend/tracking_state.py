@@ -12,12 +12,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
-from duagc.pipeline.frontend.failure import (
-    FrameIntervals,
-    FrozenImageDetector,
-    OcclusionDetector,
-    Viewpoint,
-)
+from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector, Viewpoint
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -69,6 +64,7 @@ class TrackingState:
         frames_without_color: the same for color.
         last_good: the last frame with depth and color and nothing in front of it.
         recent: time and T_map_camera of the last frames that were tracked without a loss between them.
+        followed_m_s: by how much those that were tracked last came forward in a second, before a loss too.
         turns: by a gyroscope and by the images, of the last frames that the images determine.
         gyro: what these say of the gyroscope.
         max_depth_offset_s: by which depth may be earlier or later than its color, of a frame that others are
@@ -95,6 +91,7 @@ class TrackingState:
     frames_without_color: int = 0
     last_good: LastGoodFrame | None = None
     recent: list[tuple[int, Array]] = field(default_factory=list)
+    followed_m_s: float = 0.0
     turns: list[Turn] = field(default_factory=list)
     gyro: GyroCorrection = field(default_factory=GyroCorrection)
     max_depth_offset_s: float = field(init=False)
@@ -290,6 +287,10 @@ class TrackingState:
         """Take the pose of the last frame that was tracked; none before a loss counts."""
         T_map_camera = self.keyframe.T_map_keyframe @ self.T_keyframe_camera
         self.recent = [*self.recent[1 - RECENT_FRAMES :], (self.stamp_ns, T_map_camera)]
+        first_ns, T_map_first = self.recent[0]
+        if self.stamp_ns > first_ns:
+            moved_m, _ = se3.distance(T_map_first, T_map_camera)
+            self.followed_m_s = 1e9 * float(moved_m) / (self.stamp_ns - first_ns)
 
     def _mean_motion(self, stamp_ns: int, duration_ns: int) -> Array | None:
         """Motion [4, 4] of the camera in some time at the mean velocity of the last frames; None if unknown."""

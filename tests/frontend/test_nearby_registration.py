@@ -147,6 +147,19 @@ def test_of_two_minima_the_one_that_fewer_samples_fit_is_the_worse(run: Undistur
         assert nearby_registration._fits_better(state, other, found) == better
 
 
+@pytest.mark.parametrize(("steps_m", "speed_m_s"), [([0.3] * 8, 18.0), ([0.3, -0.3] * 4, 3.0)])
+def test_what_is_driven_may_be_faster_and_what_is_shaken_not(
+    run: Undisturbed, steps_m: list[float], speed_m_s: float
+) -> None:
+    state, _ = prepared(run)
+    for step_m in steps_m:
+        state.stamp_ns += 33_333_333
+        state.T_keyframe_camera = state.T_keyframe_camera @ se3.exp(np.array([step_m, 0, 0, 0, 0, 0]))
+        state.remember_pose()
+    reach = feature_checks.reach_factor(state.keyframe.median_depth_m)
+    assert feature_checks.farthest_m(state, 1.0, state.keyframe) == pytest.approx(speed_m_s * reach, rel=0.02)
+
+
 def test_features_are_not_asked_of_a_frame_that_looks_as_usual(
     run: Undisturbed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
