@@ -18,7 +18,8 @@ from duagc.pipeline.config.frontend import FailureConfig
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels, carried
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.masks import Mask
-from duagc.pipeline.geometry.projection import FREE, free_space
+from duagc.pipeline.kernels.free_space import free_space
+from duagc.pipeline.kernels.free_space_definition import FREE, UNKNOWN
 from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid
 
 Image = NDArray[np.floating]
@@ -110,6 +111,30 @@ class FrozenImageDetector:
         return known > 0 and same >= self.config.frozen_share * known
 
 
+@dataclass
+class RecentMedian:
+    """The median of the last values of something.
+
+    Attributes:
+        most: number of the last values whose median is taken.
+        values: these, in order.
+        median: of them; 0 before there is one.
+    """
+
+    most: int
+    values: tuple[float, ...] = ()
+    median: float = 0.0
+
+    def add(self, value: float) -> None:
+        """Take the next value.
+
+        Args:
+            value: it.
+        """
+        self.values = (*self.values, value)[-self.most :]
+        self.median = float(np.median(self.values))
+
+
 class FrameIntervals:
     """How much time lies between frames."""
 
@@ -119,9 +144,8 @@ class FrameIntervals:
         Args:
             frames: number of the last intervals whose median is taken.
         """
-        self._frames = frames
         self._last_ns: int | None = None
-        self._intervals_s: tuple[float, ...] = ()
+        self._last_s = RecentMedian(frames)
 
     def update(self, stamp_ns: int) -> None:
         """Take the stamp of the next frame.
@@ -130,14 +154,13 @@ class FrameIntervals:
             stamp_ns: its time.
         """
         if self._last_ns is not None:
-            interval_s = (stamp_ns - self._last_ns) * 1e-9
-            self._intervals_s = (*self._intervals_s, interval_s)[-self._frames :]
+            self._last_s.add((stamp_ns - self._last_ns) * 1e-9)
         self._last_ns = stamp_ns
 
     @property
     def median_s(self) -> float:
         """Median of the last intervals, seconds; 0 before there is one."""
-        return float(np.median(self._intervals_s)) if self._intervals_s else 0.0
+        return self._last_s.median
 
 
 def _normalized(gray: Image) -> Image:
@@ -215,14 +238,15 @@ def free_space_violations(
     Returns:
         Number of violations, and number of pixels whose place the keyframe measured.
     """
-    _, where = free_space(
-        se3.transform(T_keyframe_camera, level.points),
+    where = free_space(
+        level.points,
+        T_keyframe_camera,
         keyframe.nearest,
         level.camera,
         gate_m=config.free_space_gate_m,
         gate_relative=config.free_space_gate_relative,
     )
-    return int(np.count_nonzero(where == FREE)), len(where)
+    return int(np.count_nonzero(where == FREE)), int(np.count_nonzero(where != UNKNOWN))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,9 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.masks import Mask, large_regions
-from duagc.pipeline.geometry.projection import FREE, ON_SURFACE, SAME_SURFACE, free_space
+from duagc.pipeline.geometry.projection import SAME_SURFACE
+from duagc.pipeline.kernels.free_space import free_space
+from duagc.pipeline.kernels.free_space_definition import FREE, ON_SURFACE, UNKNOWN
 from duagc.pipeline.registration import Level
 
 Image = NDArray[np.floating]
@@ -107,16 +109,17 @@ def _votes(points_map: Array, seen: Sequence[tuple[Level, Array]], config: Front
     n = len(points_map)
     free, there, judged = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, bool)
     for level, T_map_view in seen:
-        index, where = free_space(
-            se3.transform(se3.inverse(T_map_view), points_map),
+        where = free_space(
+            points_map,
+            se3.inverse(T_map_view),
             level.nearest,
             level.camera,
             gate_m=config.tracking.registration.depth_gate_m,
             gate_relative=config.tracking.registration.depth_gate_relative,
         )
-        free[index] += where == FREE
-        there[index] += where == ON_SURFACE
-        judged[index] = True
+        free += where == FREE
+        there += where == ON_SURFACE
+        judged |= where != UNKNOWN
     is_free = (free >= config.moving.min_views) & (free > there)
     return _Votes(is_free, (there > 0) & (free <= there), float(np.count_nonzero(judged) / max(n, 1)))
 
@@ -148,19 +151,18 @@ def carried(before: Mask, inverse_depth_before: Image, view: Level, *, min_regio
 
 def _surfaces(inverse_depth: Image, among: Mask) -> NDArray[np.int32]:
     """Labels [h, w] of connected pixels between which depth makes no step; 0: not among those asked for."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    import cv2
 
-    number = np.arange(among.size).reshape(among.shape)
-    ends: list[NDArray[np.int64]] = []
-    for here, there in (
-        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
-        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+    # between every two neighbors there is a pixel more: set if they are connected
+    height, width = among.shape
+    connected = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
+    connected[::2, ::2] = among
+    for here, there, at in (
+        (np.s_[:, :-1], np.s_[:, 1:], np.s_[::2, 1::2]),
+        (np.s_[:-1], np.s_[1:], np.s_[1::2, ::2]),
     ):
         one, other = inverse_depth[here], inverse_depth[there]
-        joined = among[here] & among[there] & (np.abs(one - other) < SAME_SURFACE * np.maximum(one, other))
-        ends.append(np.stack([number[here][joined], number[there][joined]]))
-    i, j = np.concatenate(ends, axis=1)
-    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(among.size, among.size))
-    _, labels = connected_components(graph, directed=False)
-    return np.where(among, labels.reshape(among.shape) + 1, 0).astype(np.int32)
+        same = np.abs(one - other) < SAME_SURFACE * np.maximum(one, other)
+        connected[at] = among[here] & among[there] & same
+    _, labels = cv2.connectedComponents(connected, connectivity=4, ltype=cv2.CV_32S)
+    return np.asarray(labels[::2, ::2], dtype=np.int32)

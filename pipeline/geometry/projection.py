@@ -1,4 +1,4 @@
-"""What one view shows of another: projection, visibility, overlap, free space.
+"""What one view shows of another: projection, visibility, overlap.
 
 Everywhere: a pixel's center has integer coordinates, columns u and rows v; z is the depth along the optical axis.
 """
@@ -15,12 +15,9 @@ Indices = NDArray[np.int64]
 Image = NDArray[np.floating]
 
 NEAR_M = 0.05  # points nearer to the image plane are not projected: their pixels mean little
-NEAR_GATE = 0.25  # of the depth: gates in meters of near surfaces are no larger
 SAME_SURFACE = 0.1  # relative difference of depth up to which two views show the same surface
 PARTS = (4, 5)  # rows and columns of parts that `covered` counts
 BEHIND_COSINE = 0.2  # between ray and normal; beyond, a surface is seen from behind: noisy normals scatter
-
-FREE, ON_SURFACE, HIDDEN = 1, 0, -1  # where a point is as a view saw it: see `free_space`
 
 
 def inside(u: NDArray, v: NDArray, shape: tuple[int, ...], margin_px: int = 0) -> NDArray[np.bool_]:
@@ -139,33 +136,6 @@ def from_behind(points_camera: NDArray[np.floating], normals: NDArray[np.floatin
     away = np.sum(points_camera * normals, axis=-1)
     squares = np.sum(points_camera * points_camera, axis=-1)
     return np.asarray((away > 0) & (away * away > BEHIND_COSINE**2 * squares))
-
-
-def free_space(
-    points_camera: Array, nearest: Image, camera: PinholeCamera, *, gate_m: float, gate_relative: float
-) -> tuple[Indices, NDArray[np.int8]]:
-    """Where points are, as far as a view can judge it: in space that it saw to be free, on a surface, or hidden.
-
-    In a rigid world a surface inside a view is never nearer than what the view measured there.
-
-    Args:
-        points_camera: [n, 3], meters, in the frame of the view.
-        nearest: [h, w], `largest_of_3x3` of the view's inverse depth, 1/m, 0 = unknown.
-        camera: of the view.
-        gate_m: a point must differ by this from the measured depth not to be on the surface; less of surfaces that
-            are so near that it is more than a quarter of their depth.
-        gate_relative: the same as a share of the measured depth; the larger limit holds.
-
-    Returns:
-        Rows of the points whose place the view measured, and for each FREE, ON_SURFACE or HIDDEN.
-    """
-    index, u, v = visible(camera, points_camera)
-    inverse = nearest[v, u]
-    index, inverse = index[inverse > 0], inverse[inverse > 0]
-    z_view, z_point = 1 / inverse.astype(np.float64), points_camera[index, 2]
-    gate = np.maximum(np.minimum(gate_m, NEAR_GATE * z_view), gate_relative * z_view)
-    where = np.where(z_point < z_view - gate, FREE, np.where(z_point > z_view + gate, HIDDEN, ON_SURFACE))
-    return index, where.astype(np.int8)
 
 
 def largest_of_3x3(image: Image) -> Image:

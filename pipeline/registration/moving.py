@@ -20,7 +20,9 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
 from duagc.pipeline.geometry.masks import large_regions
-from duagc.pipeline.geometry.projection import FREE, ON_SURFACE, back_project, free_space, largest_of_3x3
+from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
+from duagc.pipeline.kernels.free_space import free_space
+from duagc.pipeline.kernels.free_space_definition import FREE, ON_SURFACE
 from duagc.pipeline.registration.pyramid import Level
 
 Image = NDArray[np.floating]
@@ -81,16 +83,16 @@ class FreeSpace:
         z = 1 / view.inverse_depth[v, u].astype(np.float64)
         points_map = se3.transform(view.T_map_camera, back_project(self._small, u, v, z))
         for other in self._nearest(view):
-            points = se3.transform(se3.inverse(other.T_map_camera), points_map)
-            seen, where = free_space(
-                points,
+            where = free_space(
+                points_map,
+                se3.inverse(other.T_map_camera),
                 other.nearest,
                 self._small,
                 gate_m=self.config.gate_m,
                 gate_relative=self.config.gate_relative,
             )
-            through[seen] += where == FREE
-            there[seen] += where == ON_SURFACE
+            through += where == FREE
+            there += where == ON_SURFACE
         found = np.zeros(view.inverse_depth.shape, bool)
         found[v, u] = (through >= self.config.min_views) & (through > there)
         return self._regions(found)

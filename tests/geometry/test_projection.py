@@ -1,4 +1,4 @@
-"""Projection, visibility, overlap and free space follow the pinhole model."""
+"""Projection, visibility and overlap follow the pinhole model."""
 
 import numpy as np
 import pytest
@@ -45,17 +45,6 @@ def test_visible_points_are_before_the_camera_and_inside_the_image() -> None:
     assert v.max() < 27
 
 
-@pytest.mark.parametrize("z", [0.25, 0.4, 0.8, 2.0])
-def test_what_stands_before_a_surface_is_in_free_space_however_near_it_is(z: float) -> None:
-    """A hand at 60 % of the distance, as a wall is seen from 25 cm or from 2 m."""
-    nearest = projection.largest_of_3x3(1 / wall(z))
-    for share, expected in ((0.6, projection.FREE), (1.0, projection.ON_SURFACE), (1.4, projection.HIDDEN)):
-        points = points_of(wall(share * z))
-        index, where = projection.free_space(points, nearest, CAMERA, gate_m=0.15, gate_relative=0.1)
-        assert len(index) == len(points)
-        assert (where == expected).all()
-
-
 def test_nothing_is_visible_of_no_points() -> None:
     assert all(len(part) == 0 for part in projection.visible(CAMERA, np.zeros((0, 3))))
     assert projection.overlap(np.zeros((0, 3)), CAMERA, depth_m=wall(1)) == 0.0
@@ -86,26 +75,6 @@ def test_of_the_image_of_a_nearer_camera_all_is_covered() -> None:
     assert projection.covered(points, CAMERA, half, normals) == pytest.approx(0.6)
     assert projection.covered(points, CAMERA, near, -normals) == 0.0
     assert projection.covered(points, CAMERA, np.zeros_like(near), normals) == 0.0
-
-
-def test_points_before_a_wall_are_in_free_space_and_those_behind_it_hidden() -> None:
-    depth = wall(2.0)
-    depth[:, :10] = 0  # not measured: nothing can be said there
-    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
-    nearest = projection.largest_of_3x3(inverse)
-    points = points_of(wall(2.0)).reshape(CAMERA.height, CAMERA.width, 3)
-    unknown = (nearest == 0).sum()
-    assert unknown == 9 * CAMERA.height
-    for factor, where in (
-        (0.5, projection.FREE),
-        (0.95, projection.ON_SURFACE),
-        (1.05, projection.ON_SURFACE),
-        (1.5, projection.HIDDEN),
-    ):
-        moved = factor * points.reshape(-1, 3)
-        index, found = projection.free_space(moved, nearest, CAMERA, gate_m=0.15, gate_relative=0.1)
-        assert len(index) == CAMERA.width * CAMERA.height - unknown
-        assert (found == where).all()
 
 
 def test_the_largest_of_3x3_is_that_of_the_neighborhood() -> None:

@@ -123,6 +123,18 @@ struct DisplacedDepth {
     const double* depth;  // [h, w]
 };
 
+// Points of any frame, and the view that judges where they are.
+constexpr int8_t PLACE_FREE = 1, PLACE_ON_SURFACE = 0, PLACE_HIDDEN = -1, PLACE_UNKNOWN = -2;
+struct JudgedPoints {
+    size_t count;
+    int width, height;
+    PinholeNumbers camera;
+    double near_m, near_gate, gate_m, gate_relative;
+    const double* points;         // [n, 3]
+    const double* T_view_points;  // [3, 4]
+    const float* nearest;         // [h, w], 1/m, 0 = unknown
+};
+
 // Memory of one thread, kept between calls.
 struct AlignmentScratch {
     Scratch<float> floats;
@@ -153,6 +165,8 @@ struct RegistrationKernels {
     void (*register_depth)(const RegisteredDepth&, int32_t* pixels, double* depths, double* images, float* depth);
     // Depth [h, w]. Memory: two rows of the depth image.
     void (*displace_depth)(const DisplacedDepth&, double* inverse, double* x, double* depth);
+    // [n]: one of PLACE_...
+    void (*free_space)(const JudgedPoints&, int8_t* where);
 };
 
 }  // namespace raster
