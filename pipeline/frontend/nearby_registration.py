@@ -20,8 +20,9 @@ from duagc.pipeline.frontend.pose_checks import (
     PoseCheck,
     verify,
 )
+from duagc.pipeline.frontend.prediction import Prediction
 from duagc.pipeline.frontend.stable_registration import register_until_stable
-from duagc.pipeline.frontend.tracking_state import Prediction, TrackingState
+from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, RegistrationConfig, register
 

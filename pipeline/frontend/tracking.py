@@ -280,8 +280,7 @@ class Tracker:
         state.remember_pose()
         self._relocalizer.reset()
         if followed and found.without is Reason.NONE:
-            frames = state.config.tracking.failure.usual_frames
-            state.gray_rms = [*state.gray_rms, result.rms_gray][-frames:]
+            state.gray_rms.add(result.rms_gray)
 
     def _update_view(self, frame: CurrentFrame, found: PoseCandidate) -> None:
         """What is in front of the camera, by a frame with depth and color; and the last good frame."""

@@ -12,7 +12,14 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
-from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector, Viewpoint
+from duagc.pipeline.frontend.failure import (
+    FrameIntervals,
+    FrozenImageDetector,
+    OcclusionDetector,
+    RecentMedian,
+    Viewpoint,
+)
+from duagc.pipeline.frontend.prediction import LastPrediction, Prediction
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -25,21 +32,6 @@ EXTRAPOLATED_INTERVALS = 1.5
 MOST_INTERVALS = 8
 """That a velocity predicts, which was measured over one: images that waited in a driver come in bursts."""
 RECENT_FRAMES = 7  # whose mean velocity moves depth of another time
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Where the camera should be.
-
-    Attributes:
-        T_keyframe_camera: [4, 4], in the keyframe that frames are tracked against.
-        information: [6, 6] of its right tangent, from the motion prior of the log; None: it is no measurement.
-        sigma_px: how far the view may be from there, pixels of the coarsest image that a registration begins with.
-    """
-
-    T_keyframe_camera: Array
-    information: Array | None
-    sigma_px: float = 0.0
 
 
 @dataclass
@@ -83,7 +75,6 @@ class TrackingState:
     stamp_ns: int = 0
     velocity: Array = field(default_factory=lambda: np.zeros(6))
     lost: bool = False
-    gray_rms: list[float] = field(default_factory=list)
     gain: float = 1.0
     gain_step: float = math.inf
     depth_color_inconsistent: bool = False
@@ -95,15 +86,19 @@ class TrackingState:
     turns: list[Turn] = field(default_factory=list)
     gyro: GyroCorrection = field(default_factory=GyroCorrection)
     max_depth_offset_s: float = field(init=False)
+    gray_rms: RecentMedian = field(init=False)
     intervals: FrameIntervals = field(init=False)
     frozen: FrozenImageDetector = field(init=False)
     occlusion: OcclusionDetector = field(init=False)
+    _prediction: LastPrediction = field(init=False)
 
     def __post_init__(self) -> None:
         self.max_depth_offset_s = self.config.keyframes.max_depth_offset_s
+        self.gray_rms = RecentMedian(self.config.tracking.failure.usual_frames)
         self.intervals = FrameIntervals(self.config.tracking.failure.interval_frames)
         self.frozen = FrozenImageDetector(self.config.tracking.failure)
         self.occlusion = OcclusionDetector(self.config.tracking.failure)
+        self._prediction = LastPrediction()
 
     def copied(self, config: FrontendConfig | None = None) -> TrackingState:
         """The same state, to go on from independently; what was measured is shared, for it never changes.
@@ -117,11 +112,10 @@ class TrackingState:
             config=config,
             keyframes=list(self.keyframes),
             pairs=list(self.pairs),
-            gray_rms=list(self.gray_rms),
             recent=list(self.recent),
             turns=list(self.turns),
         )
-        other.intervals = copy.copy(self.intervals)
+        other.gray_rms, other.intervals = copy.copy(self.gray_rms), copy.deepcopy(self.intervals)
         other.frozen, other.occlusion = copy.copy(self.frozen), copy.copy(self.occlusion)
         other.frozen.config = other.occlusion.config = config.tracking.failure
         return other
@@ -168,6 +162,11 @@ class TrackingState:
         Args:
             stamp_ns: the time.
         """
+        last = self.stamp_ns, self.T_keyframe_camera, self.velocity, self.keyframe
+        basis = (stamp_ns, *last, self.gyro, self.intervals.median_s)
+        return self._prediction.of(basis, lambda: self._predicted(stamp_ns))
+
+    def _predicted(self, stamp_ns: int) -> Prediction:
         last, elapsed_s = self.T_keyframe_camera, self.elapsed_s(stamp_ns)
         followed = last @ se3.exp(self.velocity * elapsed_s) if self._is_fresh(elapsed_s) else last
         motion = self._moved(self.stamp_ns, stamp_ns)
@@ -336,7 +335,7 @@ class TrackingState:
     @property
     def usual_gray_rms(self) -> float:
         """Median gray residual of the last frames that were followed; 0 before there is one."""
-        return float(np.median(self.gray_rms)) if self.gray_rms else 0.0
+        return self.gray_rms.median
 
     def looks_worse_than_usual(self, result: Registration) -> bool:
         """Whether gray values fit much less well than those of other frames; False before there are others.
@@ -345,7 +344,7 @@ class TrackingState:
             result: of a registration with color.
         """
         largest = self.config.tracking.failure.color_check_gray_of_usual * self.usual_gray_rms
-        return bool(self.gray_rms) and result.rms_gray > largest
+        return bool(self.gray_rms.values) and result.rms_gray > largest
 
     @property
     def largest_gray_rms(self) -> float:

@@ -29,6 +29,9 @@ SMALL = (
 CONFIG = load_config(RunConfig, overrides=[*SMALL, "frontend.tracking.strides=[2, 1, 1, 1]"]).frontend
 
 
+MOST_KILLS = 100
+
+
 class KilledError(Exception):
     """In place of a signal."""
 
@@ -68,10 +71,11 @@ class Runs:
         return content_digest(out)
 
     def until_done(self, most: int) -> str:
-        """The digest of its log, with so many steps between two kills."""
-        while (found := self.run(most)) is None:
-            pass
-        return found
+        """The digest of its log, with so many steps between two kills; each time it must come farther."""
+        for _ in range(MOST_KILLS):
+            if (found := self.run(most)) is not None:
+                return found
+        raise AssertionError(f"killed {MOST_KILLS} times without an end: {self.said[-1]}")
 
 
 def undisturbed(log: Path, config: FrontendConfig, folder: Path) -> tuple[str, int]:
