@@ -7,6 +7,7 @@ the ratio of both scales.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
@@ -20,7 +21,7 @@ from duagc.pipeline.base.component_names import robot_of, same_robot
 from duagc.pipeline.evaluation.feature_agreement import FEATURES, MatchedPair, match_views
 from duagc.pipeline.evaluation.network import is_inlier
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
+from duagc.pipeline.geometry.statistics import mad_sigma
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.registration.features import Features, extract
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
@@ -30,6 +31,10 @@ MOST_CLOSURES = 16
 FEWEST_CLOSURES = 4
 FLOOR = 0.003
 """Smallest stated deviation of a ratio: teams of unlike cameras with equal scales measured 0.9975 to 1.0032."""
+
+
+MEDIAN_TO_MEAN = math.sqrt(math.pi / 2)
+"""Standard deviation of the median over that of the mean, of many numbers of a normal distribution."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,6 @@ def _log_ratio(pair: MatchedPair) -> float:
 def _median(log_ratios: list[float]) -> DepthScale:
     values = np.array(log_ratios)
     median = float(np.median(values))
-    sigma = MAD_TO_SIGMA * float(np.median(np.abs(values - median))) / np.sqrt(len(values))
+    sigma = MEDIAN_TO_MEAN * mad_sigma(values - median) / np.sqrt(len(values))
     ratio = float(np.exp(median))
     return DepthScale(ratio, ratio * max(FLOOR, float(sigma)), len(values))

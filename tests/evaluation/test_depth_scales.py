@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from duagc.pipeline.evaluation import depth_scales
@@ -38,3 +39,18 @@ def test_depth_that_is_longer_is_found(
     assert of_bravo["depth_ratio_closures"] >= depth_scales.FEWEST_CLOSURES
     assert isinstance(depth_scales.section(run.robots["alpha"], found)["depth_ratio"], Absent)
     assert isinstance(depth_scales.section(run.robots["bravo"], {})["depth_ratio"], Absent)
+
+
+def test_the_stated_deviation_is_that_of_a_median() -> None:
+    """By chance alone the median of so many normal numbers deviates a quarter more than their mean does."""
+    draws = 0.02 * np.random.default_rng(0).standard_normal((4000, depth_scales.MOST_CLOSURES))
+    found = [depth_scales._median(row.tolist()) for row in draws]
+    spread = np.std([np.log(scale.ratio) for scale in found])
+    stated = np.sqrt(np.mean([(scale.sigma / scale.ratio) ** 2 for scale in found]))
+    assert stated == pytest.approx(spread, rel=0.06)  # a fifth too small without the factor of a median
+
+
+def test_points_twice_as_far_apart_are_twice_the_scale() -> None:
+    points = np.random.default_rng(1).normal(size=(30, 3))
+    pair = depth_scales.MatchedPair(0, 1, points, 2.0 * points + [1.0, 0.0, 5.0])
+    assert depth_scales._log_ratio(pair) == pytest.approx(np.log(2.0))
