@@ -23,11 +23,11 @@ from duagc.pipeline.config.frontend import LoopConfig
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.spd import add_covariance
+from duagc.pipeline.geometry.statistics import CHI2_6_MEDIAN
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, graduated_weights
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 
 CHI2_6_999 = 22.46  # 99.9 % quantile of chi^2 with 6 degrees of freedom
-CHI2_6_50 = 5.35  # its median
 GROWTH = 1.4  # of the control parameter per step
 LAST_CONTROL = 300.0
 LINEAR_FROM = 1e9  # sigmas: no Huber weights besides
@@ -106,7 +106,7 @@ def _bends(added: Array, path: Sequence[RelativePose], closures: Sequence[Relati
     ends = np.sort([(pair.i, pair.j) for pair in path], axis=1)
     spans = {(min(closure.i, closure.j), max(closure.i, closure.j)) for closure in closures}
     between = [added[(ends[:, 0] >= first) & (ends[:, 1] <= last)] for first, last in spans]
-    return any(part.size and float(np.median(part)) > CHI2_6_50 for part in between)
+    return any(part.size and float(np.median(part)) > CHI2_6_MEDIAN for part in between)
 
 
 def _path_errors(

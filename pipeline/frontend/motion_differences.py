@@ -22,7 +22,7 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.motion_times import MotionTimeConfig
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.geometry.statistics import CHI2_6_MEDIAN, evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration import Outcome
@@ -37,7 +37,6 @@ MEASURED = (Outcome.OK, Outcome.ILL_CONDITIONED)  # directions that are not dete
 BY_COLOR = RegistrationConfig(residuals="gray")
 BY_DEPTH = RegistrationConfig(residuals="depth")
 FIRST_SIGMA_S = 1.0  # of a time of which nothing is known
-CHI2_6_MEDIAN = 5.348  # median of chi^2 with 6 degrees of freedom
 ROUNDS = 20  # of reweighting
 PARTS = 5  # of the log, each of which is left out once
 CHANCE_SIGMAS = 2.0  # up to which a time may be chance

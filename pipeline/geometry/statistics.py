@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAD_TO_SIGMA = 1.4826  # median absolute deviation to standard deviation, of a normal distribution
+CHI2_6_MEDIAN = 5.348  # of chi^2 with 6 degrees of freedom
 
 
 def mad_sigma(deviations: NDArray[np.floating]) -> float:
