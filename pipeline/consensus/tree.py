@@ -116,6 +116,7 @@ class TreeNode:
         self._damping = self._damped = 0.0
         self._moved_rad = self._step_before = np.inf  # since the last linearization; of the exchange before
         self._cost: float | None = None  # at the root: of the last accepted poses
+        self._returned = False  # at the root: the last step was refused, and all robots are where they were before it
         self._sent = -1  # exchange whose block went up
 
     # --- messages
@@ -257,10 +258,14 @@ class TreeNode:
         """At the root: was the last step good, and what comes next."""
         small = block.largest_step < self.tolerance and self.exchange > 0
         accepted = block.reweighted or self._cost is None or block.cost <= self._cost * (1 + _ROUNDING)
-        damping = max(1e-6, 10 * self._damping) if not accepted else self._damping / 10
+        damping = self._damping  # of the step that comes after a return: it is the first one at these poses
+        if not accepted:
+            damping = max(1e-6, 10 * damping)
+        elif not self._returned:
+            damping = damping / 10 if damping > 1e-7 else 0.0
         if accepted:
             self._cost = block.cost
-            damping = damping if damping > 1e-8 else 0.0
+        self._returned = not accepted
         fresh = not accepted or block.largest_step > _SLOW * self._step_before
         self._step_before = block.largest_step if self.exchange else np.inf
         finished = small and not block.unsure

@@ -1,12 +1,13 @@
 """One end of a link: its metric, its copies, which of the shared keyframes pull, what of a packet counts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from duagc.pipeline.config.consensus import LoopClosureConfig, PoseConsensusConfig
-from duagc.pipeline.consensus import admm_penalties
+from duagc.pipeline.consensus import admm_penalties, admm_weights
 from duagc.pipeline.consensus.admm_edge import (
     REMEMBERED,
     AdmmEdge,
@@ -16,7 +17,7 @@ from duagc.pipeline.consensus.admm_edge import (
     start_of_copies,
 )
 from duagc.pipeline.posegraph.least_squares import retract
-from duagc.pipeline.posegraph.relative_poses import LoopClosure
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
 from tests.fixtures.pose_worlds import random_information, random_poses
 
 CONFIG = PoseConsensusConfig()
@@ -161,3 +162,21 @@ def test_parts_of_a_packet_that_name_other_keyframes_have_no_place():
     np.testing.assert_array_equal(link.places_of(packet(1, [5, 9])), [1, 2])
     assert link.places_of(packet(1, [5, 10])) is None
     assert link.places_of(packet(1, [3])) is None
+
+
+@pytest.mark.parametrize("slow", [0, 1])
+def test_own_loops_wait_for_the_slowest_link(slow):
+    """Their weights follow poses that all links move."""
+    links = [received(edge(), total=40.0) for _ in range(2)]
+    for link in links:
+        link.changes[:] = 1e-6
+    asked = []
+    weights = SimpleNamespace(advance=lambda total, steady, squared: asked.append((total, steady)) or True)
+    loops = RelativePoses.empty()
+    assert admm_weights.advance_loops(weights, loops, links, np.zeros((0, 4, 4)), config=CONFIG)
+    links[slow].received_total = 3.0
+    admm_weights.advance_loops(weights, loops, links, np.zeros((0, 4, 4)), config=CONFIG)
+    links[slow].received_total = 40.0
+    links[slow].changes[0, -1] = 1.0
+    admm_weights.advance_loops(weights, loops, links, np.zeros((0, 4, 4)), config=CONFIG)
+    assert asked == [(40.0, True), (3.0, False), (40.0, False)]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.consensus import ColorConfig
-from duagc.pipeline.consensus.colors import team_colors
+from duagc.pipeline.consensus import colors
+from duagc.pipeline.consensus.colors import TeamColors, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.splat.information import COLOR
 
@@ -159,3 +160,43 @@ def test_colors_that_change_a_little_change_the_answer_a_little():
     after = team_colors(rounded, pairs, CONFIG).between("bravo", "alpha")
     np.testing.assert_allclose(after.gain, before.gain, atol=3e-6)
     np.testing.assert_allclose(after.offset, before.offset, atol=3e-6)
+
+
+def test_the_deviation_of_a_difference_is_that_of_least_squares():
+    """Of a robot's gain against another's, both of which are known from the same comparisons."""
+    rng = np.random.default_rng(4)
+    rows = [(0, 1, 0.3, 0.01), (1, 2, -0.1, 0.02), (0, 2, 0.25, 0.04)]
+    design = np.zeros((6, 3))
+    for k, (i, j, _, variance) in enumerate(rows):
+        design[k, [i, j]] = np.array([-1.0, 1.0]) / np.sqrt(variance)
+    design[3:] = np.eye(3) / 0.5
+    right = np.array([d / np.sqrt(v) for _, _, d, v in rows] + [0.0] * 3)
+    values, covariance = colors._differences(3, rows, 0.5)
+    np.testing.assert_allclose(values, np.linalg.lstsq(design, right, rcond=None)[0], atol=1e-12)
+    np.testing.assert_allclose(covariance, np.linalg.inv(design.T @ design), atol=1e-12)
+
+    names, scale = ("alpha", "bravo", "charlie"), dict(zip(GAIN, rng.uniform(0.5, 2.0, (3, 3)), strict=True))
+    shift = dict(zip(GAIN, rng.normal(size=(3, 3)), strict=True))
+    of_channels = np.repeat(covariance[..., None], 3, axis=-1)
+    team = TeamColors(names, scale, shift, of_channels, 4.0 * of_channels, {})
+    for i, j in itertools.permutations(range(3), 2):
+        contrast = np.eye(3)[i] - np.eye(3)[j]
+        sigma = np.sqrt(contrast @ covariance @ contrast)
+        found = team.between(names[i], names[j])
+        np.testing.assert_allclose(found.sigma_gain, sigma)
+        np.testing.assert_allclose(found.sigma_offset, 2.0 * sigma / scale[names[j]])
+
+
+@pytest.mark.parametrize("blind", ["alpha", "bravo"])
+def test_colors_without_information_are_not_compared_whosever_they_are(blind):
+    evidence, pairs = world(gain={k: GAIN[k] for k in ("alpha", "bravo")})
+    wrong = np.arange(4000) % 2 == 0
+    information = evidence[blind].information.copy()
+    information[wrong, 28] = 0.0
+    theta = evidence[blind].theta.copy()
+    theta[wrong, COLOR] = 0.9
+    evidence[blind] = replace(evidence[blind], theta=theta, information=information)
+    found = team_colors(evidence, pairs, CONFIG).between("bravo", "alpha")
+    gain, _ = true_map("bravo", "alpha")
+    assert found.matches == 2000
+    assert (np.abs(np.log(found.gain / gain)) < 0.03).all()

@@ -86,6 +86,16 @@ def test_depth_images_say_how_far_a_surface_is_where_the_sums_know_nothing_of_a_
     assert np.all(values[:, :2] < 1e-6)  # along it, nothing
 
 
+def test_a_mean_on_the_measured_surface_is_known_to_a_tenth_of_a_millimeter():
+    gaussians, sums, _ = random_map(9)
+    sums.geometry *= 1e-12
+    sums.deviation_m[:] = 0.0
+    position = Evidence.from_map(
+        "alpha", gaussians, sums, np.tile(np.eye(4), (4, 1, 1))
+    ).position_information()
+    np.testing.assert_allclose(np.linalg.eigvalsh(position)[:, 2], 1e8, rtol=1e-6)
+
+
 def test_a_motion_of_the_world_leaves_every_mahalanobis_distance():
     """What the evidence says about any hypothesis does not depend on the frame."""
     gaussians, sums, T_map_keyframe = random_map(2)

@@ -212,3 +212,14 @@ def test_directions_that_nobody_knows_stay_out() -> None:
     W.position[0] = np.diag([0.0, 4.0, 0.0])
     x = np.ones((1, COORDINATES))
     assert np.array_equal(W.inverse().times(W.times(x))[0, :3], [0, 1, 0])
+
+
+def test_rounding_of_a_direction_that_nobody_knows_is_no_knowledge() -> None:
+    """Of a plane that is turned, the eigenvalues along it are a few ulps instead of zero."""
+    rng = np.random.default_rng(4)
+    normals = rng.normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    W = Weights.of_diagonal(np.zeros((50, COORDINATES)))
+    W.position[:] = 1e6 * normals[:, :, None] * normals[:, None, :]
+    across = normals[:, :, None] * normals[:, None, :] / 1e6
+    np.testing.assert_allclose(W.inverse().position, across, atol=1e-16)

@@ -144,3 +144,59 @@ def test_the_best_of_each_is_the_least_and_of_equal_ones_that_of_the_least_tie()
     tie = np.array([7, 4, 1, 2, 3, 9])
     assert matching._best_of_each(group, d, 1.0, lambda at: tie[at]).tolist() == [1, 3]
     assert not len(matching._best_of_each(group, d, 0.1, lambda at: tie[at]))
+
+
+def random_splats(rng, owner, n):
+    """Theta in every part, with scales [n, 3] of which some, in any place, are at or below the floor."""
+    quats = rng.normal(size=(n, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    log_scales = np.log(CONFIG.thickness_floor_m) + rng.uniform(0.1, 2.0, size=(n, 3))
+    thin = rng.random(n) < 0.5
+    log_scales[thin, 2] = np.log(CONFIG.thickness_floor_m) - rng.uniform(0, 0.5, size=thin.sum())
+    theta = rng.normal(size=(n, 13))
+    theta[:, MEAN] *= 0.05
+    theta[:, LOG_COVARIANCE] = spd.log_covariance(quats, log_scales)
+    return Evidence(owner, np.arange(n), np.zeros(n), theta, np.zeros((n, 31))), quats, log_scales, thin
+
+
+def test_the_distance_is_the_documented_one():
+    """Pair by pair, from rotations and scales instead of eigenvectors of log-covariances."""
+    rng = np.random.default_rng(8)
+    (a, *shape_a), (b, *shape_b) = (random_splats(rng, name, 60) for name in ("alpha", "bravo"))
+    floor = np.log(CONFIG.thickness_floor_m)
+    expected = []
+    for k in range(60):
+        logs, axes, thin = [], [], []
+        for quats, log_scales, is_thin in (shape_a, shape_b):
+            R = so3.from_quat_wxyz(quats[k])
+            logs.append(R @ np.diag(2 * np.maximum(log_scales[k], floor)) @ R.T)
+            axes.append(R[:, 2])
+            thin.append(is_thin[k])
+        delta = logs[0] - logs[1]
+        if thin[0] != thin[1]:
+            axis = axes[0] if thin[0] else axes[1]
+            delta = delta - (axis @ delta @ axis) * np.outer(axis, axis)
+        apart = a.theta[k] - b.theta[k]
+        expected.append(
+            np.sum(apart[MEAN] ** 2) / CONFIG.position_scale_m**2
+            + 0.1 * np.sum(delta**2)
+            + np.sum((apart[COLOR] / (0.5 / np.sqrt(np.pi))) ** 2)
+            + 0.5 * apart[12] ** 2
+        )
+    rows = np.arange(60)
+    found = gaussian_distance(a, rows, b, rows, config=CONFIG)
+    np.testing.assert_allclose(found, np.sqrt(expected), rtol=1e-9)
+    np.testing.assert_allclose(gaussian_distance(b, rows, a, rows, config=CONFIG), found, rtol=1e-9)
+
+
+def test_a_gaussian_is_no_neighbor_of_itself():
+    """Two at one place, of another opacity: a search names either of them first."""
+    single = surface("alpha", 9, n=100)
+    theta = np.repeat(single.theta, 2, axis=0)
+    theta[1::2, 12] += 4.0
+    doubled = Evidence(
+        "alpha", np.arange(len(theta)), np.zeros(len(theta)), theta, np.zeros((len(theta), 31))
+    )
+    assert threshold(doubled, CONFIG) == pytest.approx(np.sqrt(0.5) * 4.0)
+    least = CONFIG.model_copy(update={"percentile": 1.0})
+    assert threshold(doubled, least) == pytest.approx(np.sqrt(0.5) * 4.0)
