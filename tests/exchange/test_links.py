@@ -125,6 +125,34 @@ def test_a_bandwidth_holds() -> None:
     )  # a link each way
 
 
+def test_a_packet_may_wait_as_long_as_the_queue_allows_and_no_nanosecond_longer() -> None:
+    config = LinkConfig(latency_ns=0, bandwidth_bytes_per_s=100_000, queue_ns=10 * MS)
+    for send_ns, waits in ((0, True), (-1, False)):
+        model = LinkModel(config, 0)
+        model.fate("alpha", "bravo", sequence=0, send_ns=0, size=1000)
+        later = model.fate("alpha", "bravo", sequence=1, send_ns=send_ns, size=1000)
+        assert later.delivered == waits
+        assert later.reason == ("" if waits else link_model.QUEUE_FULL)
+
+
+def test_a_packet_meets_the_link_as_it_is_when_it_goes_on_air() -> None:
+    window = LinkWindow(sender="alpha", receiver="bravo", until_ns=5 * MS)
+    config = LinkConfig(topology="listed", windows=(window,), bandwidth_bytes_per_s=100_000)
+    model = LinkModel(config, 0)
+    fates = [model.fate("alpha", "bravo", sequence=k, send_ns=0, size=1000) for k in range(2)]
+    assert [f.reason for f in fates] == ["", link_model.DOWN]  # the second waits for 10 ms
+
+
+def test_jitter_reaches_both_ends_of_its_range() -> None:
+    late = {f.deliver_ns[0] for f in fates(LinkConfig(latency_ns=10, jitter_ns=2), 200, every_ns=0)}
+    assert late == {10, 11, 12}
+
+
+def test_a_robot_alone_has_no_link() -> None:
+    for topology in ("full", "star", "chain", "ring"):
+        assert neighbors(LinkConfig(topology=topology), ["alpha"]) == {"alpha": ()}
+
+
 def test_windows_open_close_and_have_a_direction() -> None:
     windows = (
         {"sender": "alpha", "receiver": "bravo", "until_ns": 100},
