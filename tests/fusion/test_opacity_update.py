@@ -104,3 +104,28 @@ def test_of_a_long_log_each_view_takes_what_it_sees():
     one, other = updated(1.0), updated(1.0, long)
     assert np.array_equal(one.gaussians.opacity_logits, other.gaussians.opacity_logits)
     assert not np.array_equal(one.gaussians.opacity_logits, with_imported(1.0).gaussians.opacity_logits)
+
+
+def test_the_opacity_is_where_own_pixels_and_the_owner_together_cost_least():
+    """Against a search over the logit of the disc that own images contradict; no residual is large enough to clip."""
+    n, sigma, per_sample, weight = len(wall()), 0.6, 9.0, 2.0
+    before, images = with_imported(weight), views()
+    context = MapContext(CAMERA, CONFIG.model_copy(update={"own_pixel_steps": 12}), MapMatching())
+    after = update_opacities(
+        before, images, context, num_own=n, color_sigma=sigma, pixels_per_sample=per_sample
+    )
+
+    def cost(logit: float) -> float:
+        logits = after.gaussians.opacity_logits.copy()
+        logits[n] = logit
+        shown, total = after.gaussians.replace(opacity_logits=logits), 0.5 * weight * (logit - 2.0) ** 2
+        for view in images:
+            render = Rasterizer().forward(shown, CAMERA, se3.inverse(view.T_world_camera))
+            off = render.color.astype(np.float64) - view.unit_color
+            total += np.sum(off**2) / (2 * sigma**2 * per_sample)
+        return total
+
+    tried = np.linspace(-1.5, 2.0, 141)
+    best = tried[np.argmin([cost(logit) for logit in tried])]
+    assert -1.0 < best < 1.5  # neither of the two decides alone
+    assert after.gaussians.opacity_logits[n] == pytest.approx(best, abs=0.06)

@@ -99,3 +99,11 @@ def test_gaussians_that_state_nothing_do_not_count():
     information[::2] = 0.0
     half = Evidence("bravo", whole.ids, whole.anchors, whole.theta, information)
     assert stated_scale([half], CAMERA, of_wall(), CONFIG) == pytest.approx(2.0, rel=0.05)
+
+
+def test_as_many_views_as_are_asked_for_are_enough():
+    asked = len(T_MAP_CAMERAS)
+    for least, counts in ((asked, True), (asked + 1, False)):
+        config = CONFIG.model_copy(update={"min_views": least})
+        found = stated_scale([peer(errors(2.0))], CAMERA, of_wall(), config)
+        assert found == (pytest.approx(2.0, rel=0.05) if counts else 1.0)
