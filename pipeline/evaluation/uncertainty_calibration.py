@@ -51,7 +51,7 @@ def ause(sigma_m: Array, error_m: Array) -> float:
 def _mean_of_remaining(error_sorted_m: Array) -> Array:
     """Mean of the first n(1 - k/100) errors, k = 0..99: what is left when the last k percent are taken away."""
     sums = np.cumsum(error_sorted_m)
-    kept = np.maximum(1, np.ceil(len(error_sorted_m) * (1.0 - np.arange(100) / 100.0)).astype(np.int64))
+    kept = np.maximum(1, -(-len(error_sorted_m) * (100 - np.arange(100)) // 100))  # rounded up
     return sums[kept - 1] / kept
 
 

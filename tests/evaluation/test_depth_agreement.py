@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from duagc.pipeline.evaluation.depth_agreement import MIN_PAIRS, depth_agreement
+from duagc.pipeline.evaluation.depth_agreement import MIN_PAIRS, _compare, depth_agreement
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from tests.fixtures.room import CAMERA, pose, render
@@ -55,3 +55,19 @@ def test_unknown_depth_is_not_compared(depths) -> None:
     assert values["true"] < 1e-5
     _, values = depth_agreement([np.zeros_like(d) for d in depths], CAMERA, {"true": TRUTH})
     assert isinstance(values["true"], Absent)
+
+
+def test_points_are_compared_wherever_four_pixels_are_around_them() -> None:
+    """A plane whose inverse depth is linear in the image, and points on it, a little nearer to the camera."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    inverse = 0.3 + 0.001 * u + 0.0005 * v
+    rng = np.random.default_rng(2)
+    at = rng.uniform([-2, -2], [CAMERA.width + 1, CAMERA.height + 1], (4000, 2))
+    z = 1 / (0.3 + 0.001 * at[:, 0] + 0.0005 * at[:, 1])
+    rays = (at - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy]
+    points = np.column_stack([rays, np.ones(4000)]) * (z - 0.01)[:, None]
+    found = _compare(inverse, points, CAMERA)
+    whole = (at >= 0).all(axis=1) & (at[:, 0] < CAMERA.width - 1) & (at[:, 1] < CAMERA.height - 1)
+    assert found is not None
+    assert len(found) == pytest.approx(np.sum(whole), abs=2)
+    np.testing.assert_allclose(found, 0.01, atol=1e-9)

@@ -50,6 +50,20 @@ def test_a_half_is_scored_in_the_exposure_of_the_other_one() -> None:
     assert found.both == pytest.approx(together, abs=1e-9)
 
 
+def test_what_the_map_does_not_show_stays_black_in_every_exposure() -> None:
+    """Little alpha takes little of the offset, and does not take part in the fit."""
+    color, alpha = texture(), np.ones(SHAPE, np.float32)
+    alpha[::2, ::3], alpha[1::2, ::3] = 0.0, 0.4
+    offset = np.array([0.2, 0.1, 0.15])
+    image = np.clip(color * alpha[..., None] + offset * alpha[..., None], 0, 1)
+    render = replace(drawn(color * alpha[..., None]), alpha=alpha)
+    whole = alpha >= 1
+    found = fitted_psnr(render, image)
+    assert isinstance(found, FittedPsnr)
+    assert whole.mean() > 0.6
+    assert min(found.left, found.right) > 45
+
+
 def test_pixels_scored_never_change_their_own_exposure() -> None:
     color, r = texture(), np.random.default_rng(1)
     image = 0.9 * color

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from duagc.pipeline.evaluation.image_metrics import counted_windows, depth_error, ms_ssim, psnr, ssim
+from duagc.pipeline.evaluation.image_metrics import (
+    SsimReference,
+    counted_windows,
+    depth_error,
+    ms_ssim,
+    psnr,
+    ssim,
+)
 from duagc.pipeline.kernels import Render
 
 
@@ -91,3 +98,11 @@ def test_masked_scales_count_pixels_all_parts_of_which_count() -> None:
     mask[:16], mask[:, :16] = False, False
     cut = np.s_[16:, 16:]
     assert ms_ssim(x, y, mask=mask) == pytest.approx(ms_ssim(x[cut], y[cut]), abs=1e-12)
+
+
+def test_both_numbers_at_once_are_those_of_the_two_functions() -> None:
+    r = np.random.default_rng(6)
+    y = np.repeat(np.repeat(r.uniform(0, 1, (48, 60, 3)), 4, axis=0), 4, axis=1)
+    x = np.clip(y + r.normal(0, 0.1, y.shape), 0, 1)
+    assert SsimReference(y).both(x) == (ssim(x, y), ms_ssim(x, y))
+    assert ssim(x, y) < 0.95 * ms_ssim(x, y)

@@ -13,10 +13,11 @@ from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation import rendering, views
 from duagc.pipeline.evaluation.groundtruth import Surface, surface
 from duagc.pipeline.evaluation.network import Session
-from duagc.pipeline.evaluation.paths import top_view_axes
+from duagc.pipeline.evaluation.paths import _put_at_start, top_view_axes
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.views import ComparedImage
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.kernels import Render
 from duagc.pipeline.recording import LogWriter, Recording, open_rgbd
 from duagc.pipeline.report.renders import _compared
@@ -205,6 +206,18 @@ def test_the_top_view_looks_along_the_vertical_of_the_cameras():
     assert axes @ axes.T == pytest.approx(np.eye(2), abs=1e-12)
     assert axes @ T[:3, 1] == pytest.approx(np.zeros(2), abs=1e-9)
     assert abs(axes[0] @ T[:3, 0]) > 0.99  # the longer way lies to the right
+    np.testing.assert_allclose(
+        np.cross(*axes), -T[:3, 1], atol=1e-9
+    )  # from above; y of the cameras points down
+
+
+def test_a_way_before_consensus_begins_where_the_one_after_it_begins_and_keeps_its_form():
+    T = se3.exp(np.random.default_rng(0).normal(size=(2, 4, 6)))
+    before, after = (Trajectory(np.arange(4), poses) for poses in T)
+    put = _put_at_start(before, after)
+    np.testing.assert_allclose(put.poses[0], after.poses[0], atol=1e-12)
+    steps = [se3.inverse(way.poses[:-1]) @ way.poses[1:] for way in (before, put)]
+    np.testing.assert_allclose(steps[1], steps[0], atol=1e-12)
 
 
 def test_held_out_is_what_the_log_says(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from duagc.pipeline.evaluation.pixel_deviation import StatedMap, rendered_depth
+from duagc.pipeline.evaluation.pixel_deviation import LEAST_ACROSS, StatedMap, _along_rays, rendered_depth
 from duagc.pipeline.evaluation.pixel_errors import true_depth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.views import ScoredFrame
@@ -110,3 +110,16 @@ def test_recorded_depth_brings_its_own_noise_and_exact_depth_none():
     assert true_depth(ScoredFrame(logged, none), model)[1] == pytest.approx(0.03)
     mask = np.zeros((4, 4), bool)
     assert not true_depth(ScoredFrame(RgbdFrame(0, 0, color, depth_m, mask), depth_m), model)[0].any()
+
+
+def test_a_disc_seen_from_its_side_deviates_by_no_more_than_ten_times_its_own_deviation():
+    """Its normal, along z of the map, and the ray to it make 90, 89, 80 and 0 degrees."""
+    angles = np.radians([90.0, 89.0, 80.0, 0.0])
+    some = wall(2.0).select(slice(0, 4))
+    some = some.replace(means=np.stack([np.sin(angles), np.zeros(4), np.cos(angles)], axis=1))
+    T_camera_map = se3.inverse(se3.exp(np.array([0, 0, 0, 0, np.pi / 3, 0])))  # all are in front of it
+    sigma_m = np.array([0.001, 0.002, 0.003, 0.004])
+    found = _along_rays(StatedMap(some, sigma_m, "center"), T_camera_map)
+    depth = np.cos(angles - np.pi / 3)
+    np.testing.assert_allclose(found, sigma_m / np.maximum(np.cos(angles) / depth, LEAST_ACROSS), rtol=1e-6)
+    assert found[0] == pytest.approx(10 * sigma_m[0])

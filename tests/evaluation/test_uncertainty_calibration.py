@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy import stats
 
 from duagc.pipeline.evaluation import uncertainty_calibration
 
@@ -83,3 +84,32 @@ def test_right_uncertainties_order_errors_only_as_far_as_they_differ(spread, rea
     right = uncertainty_calibration.if_right(sigma, "test")
     assert np.sqrt(np.mean((right / sigma) ** 2)) == pytest.approx(1.0, abs=0.02)
     assert uncertainty_calibration.ece_rank(sigma, right) == pytest.approx(reached, abs=0.01)
+
+
+def test_likelihoods_are_those_of_normal_distributions(predicted):
+    sigma, error = predicted
+    expected = -stats.norm.logpdf(error, scale=sigma).mean()
+    assert uncertainty_calibration.nll(sigma, error) == pytest.approx(expected, rel=1e-12)
+    best = uncertainty_calibration.fitted_scale(sigma, 1.7 * error)
+    tried = [uncertainty_calibration.nll(s * best * sigma, 1.7 * error) for s in (0.99, 1.0, 1.01)]
+    assert tried[1] < min(tried[0], tried[2])
+
+
+def test_ranks_are_those_of_scipy(predicted):
+    sigma, error = (values[:500].round(3) for values in predicted)  # many are equal
+    expected = stats.spearmanr(sigma, error).statistic
+    assert uncertainty_calibration.spearman(sigma, error) == pytest.approx(expected, rel=1e-12)
+    order = np.argsort(sigma, kind="stable")
+    ranks = (stats.rankdata(error)[order] - 0.5) / 500
+    gaps = [abs((50 * b + 25) / 500 - ranks[50 * b : 50 * (b + 1)].mean()) for b in range(10)]
+    assert uncertainty_calibration.ece_rank(sigma, error) == pytest.approx(np.mean(gaps), rel=1e-12)
+
+
+def test_the_area_is_between_the_curves_of_sparsification():
+    """Of 200 Gaussians, two go at every step."""
+    rng = np.random.default_rng(8)
+    sigma, error = rng.uniform(1, 2, 200), rng.uniform(0, 1, 200)
+    by_sigma, by_error = error[np.argsort(-sigma)], np.sort(error)[::-1]
+    apart = [by_sigma[2 * k :].mean() - by_error[2 * k :].mean() for k in range(100)]
+    expected = np.mean(apart) / error.mean()
+    assert uncertainty_calibration.ause(sigma, error) == pytest.approx(expected, rel=1e-12)
