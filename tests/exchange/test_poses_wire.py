@@ -102,3 +102,28 @@ def test_unknown_precisions_are_refused(flags):
     data[8] |= flags
     with pytest.raises(MalformedError, match="flags"):
         read_poses(bytes(data), packet.keyframes, True)
+
+
+@pytest.mark.parametrize(("left_out", "taken"), [(0.5, True), (0.4, False), (0.0, False)])
+def test_rotations_whose_largest_component_is_too_small_are_refused(left_out, taken):
+    """The largest of four components of a unit quaternion is one half at least."""
+    packet = pose_packet(np.random.default_rng(5), 3)
+    others = np.sqrt((1 - left_out**2) / 3)
+    quats = packet.quats_wxyz.copy()
+    quats[1] = [1.0, others, others, others]  # the first is left out
+    data = write_poses(replace(packet, quats_wxyz=quats), 0, 3, decides=True)
+    if taken:
+        read = read_poses(data, packet.keyframes, from_decider=True)
+        np.testing.assert_allclose(read.quats_wxyz[1], [left_out, others, others, others], atol=1e-6)
+    else:
+        with pytest.raises(MalformedError, match="not rigid"):
+            read_poses(data, packet.keyframes, from_decider=True)
+
+
+@pytest.mark.parametrize("wire", ["fixed", "float32", "float64"])
+def test_no_part_is_longer_than_its_room(wire):
+    packet = pose_packet(np.random.default_rng(6), 40, wire)
+    for room_bytes in range(400, 600):
+        parts = write_poses_in_parts(packet, room_bytes, decides=True)
+        assert max(len(part) for part in parts) <= room_bytes
+        assert len(parts) == 1 or len(write_poses(packet, 0, 40, decides=True)) > room_bytes
