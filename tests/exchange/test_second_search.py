@@ -65,6 +65,11 @@ def test_overlaps_are_predicted_along_both_paths_by_the_nearest_closure() -> Non
     assert found[7, 7] == 1.0
     assert found[32, 7] == 1.0  # nearer to the false one
     assert found[5, 9] == pytest.approx(0.5, abs=0.1)
+    close = LoopClosure(12, 5, np.eye(4), np.eye(6))  # as false; both reach keyframes 4 to 13
+    for held in ([true, close], [close, true]):
+        found = overlaps(held, [WALL] * n, CAMERA, CAMERA, own=own, peer=peer)
+        assert found[7, 7] == found[13, 6] == 1.0  # two steps from the true one, two from the other one
+        assert found[6, 11] < 0.5
 
 
 def test_overlap_makes_a_pair_worth_a_sample_and_samples_at_hand_are_free() -> None:

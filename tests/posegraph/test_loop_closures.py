@@ -14,6 +14,7 @@ from duagc.pipeline.posegraph.loop_closures import (
     KeyframePoses,
     consistent,
     drift,
+    frame_variance,
     holder,
     plausible,
     robust_frame,
@@ -127,6 +128,54 @@ def test_drift_follows_the_keyframe_that_was_tracked_against():
     grown = drift(star, 3, CONFIG)
     np.testing.assert_allclose(grown[2], grown[1])
     assert grown[2, 0] < 1e-3
+
+
+def test_a_surer_way_to_a_later_keyframe_does_not_let_the_drift_fall():
+    """The third keyframe was tracked against the first as surely as the second was not."""
+    information = np.stack([1e2 * np.eye(6), 1e6 * np.eye(6)])
+    star = RelativePoses(np.array([0, 0]), np.array([1, 2]), np.tile(np.eye(4), (2, 1, 1)), information)
+    grown = drift(star, 3, CONFIG)
+    np.testing.assert_allclose(grown[1], 1 / 101 + np.square([CONFIG.drift_floor_m, CONFIG.drift_floor_rad]))
+    np.testing.assert_array_equal(grown[2], grown[1])
+
+
+def test_the_variance_of_a_frame_has_all_drift_and_the_lever_of_the_maps():
+    rng = np.random.default_rng(3)
+    closures = [LoopClosure(0, 1, np.eye(4), np.diag([1e4] * 3 + [4e4] * 3)) for _ in range(2)]
+    own, peer = random_poses(rng, 2), random_poses(rng, 3)
+    own[:, :3, 3], peer[:, :3, 3] = [[0, 0, 0], [3, 4, 0]], [[0, 0, 0], [0, 12, 0], [5, 0, 0]]
+    drifts = np.array([[0.0, 0], [0.02, 0.003]]), np.array([[0.0, 0], [0.01, 0.001], [0.05, 0.007]])
+    exact = CONFIG.model_copy(update={"sigma_floor_m": 0.0, "sigma_floor_rad": 0.0})
+    found = frame_variance(closures, KeyframePoses(own, drifts[0]), KeyframePoses(peer, drifts[1]), exact)
+    rotation = 1 / (4e4 + 1) + 0.003 + 0.007
+    lever_m2 = 5**2 + 12**2  # the diagonal of the larger map
+    expected = 1 / (1e4 + 1) + 0.02 + 0.05 + rotation * lever_m2 / 3, rotation
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_a_robust_frame_is_where_proposals_with_weights_of_cauchy_cancel():
+    rng = np.random.default_rng(6)
+    frames = np.tile(np.eye(4), (15, 1, 1))
+    frames[:, :3, 3] = 1.5 * CONFIG.frame_sigma_m * rng.normal(size=(15, 3))
+    frames[-3:, :3, 3] += 20 * CONFIG.frame_sigma_m
+    T = robust_frame(frames, CONFIG)
+    apart = (frames[:, :3, 3] - T[:3, 3]) / CONFIG.frame_sigma_m
+    weights = 1 / (1 + np.sum(apart**2, axis=1))
+    np.testing.assert_allclose(weights @ apart, 0, atol=1e-2)
+    assert (
+        np.abs(np.exp(-np.sum(apart**2, axis=1)) @ apart).max() > 0.1
+    )  # another kernel is not at rest there
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_loop_closure_may_be_implausible_by_any_axis(axis):
+    _, own, peer, grown, _, T_own_peer = pair(5)
+    off = np.zeros(6)
+    off[axis] = 3.0 if axis < 3 else 1.5
+    measured = se3.inverse(own[0]) @ T_own_peer @ peer[0]
+    closures = [LoopClosure(0, 0, T, 1e5 * np.eye(6)) for T in (measured, measured @ se3.exp(off))]
+    short = KeyframePoses(own[:1], grown[:1]), KeyframePoses((T_own_peer @ peer)[:1], grown[:1])
+    np.testing.assert_array_equal(plausible(closures, *short, CONFIG), [True, False])
 
 
 def test_unmeasured_steps_count_as_far_drift():
