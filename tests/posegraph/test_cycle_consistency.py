@@ -91,7 +91,7 @@ def test_a_false_link_with_more_closures_gives_way_to_true_ones_whose_images_agr
     assert "off the path by bravo" in found.contradictions["alpha", "charlie"]
 
 
-@pytest.mark.parametrize("supports", [(5, 5, 5), (5, 6, 9), (3, 4, 9)])
+@pytest.mark.parametrize("supports", [(5, 5, 5), (5, 6, 9), (3, 4, 9), (4, 4, 64)])
 def test_where_images_agree_everywhere_no_link_of_a_cycle_that_does_not_close_counts(supports):
     T, pairs = triangle(5, supports, 0.6)
     found = place(pairs, list(T), 4.0)
@@ -195,3 +195,10 @@ def test_the_tree_grows_along_the_best_supported_link_of_its_border():
             expected = min(border)[1] if border else (None, min(set(robots) - joined))
             assert (nearer, robot) == expected
             joined.add(robot)
+
+
+def test_a_proposal_from_the_other_side_undoes_it():
+    T = random_poses(np.random.default_rng(9), 1)[0]
+    back = Proposal(4, T, VARIANCE, 0.6).reversed()
+    np.testing.assert_allclose(back.T_a_b @ T, np.eye(4), atol=1e-12)
+    assert (back.support, back.variance, back.agreement) == (4, VARIANCE, 0.6)
