@@ -9,9 +9,10 @@ from duagc.pipeline.consensus.tree import TreeGraph, TreeNode, TreePlace
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.gnc import RobustWeights
+from duagc.pipeline.posegraph.pose_graph import solve_pose_graph
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 from tests.consensus.test_elimination import robots_of
-from tests.fixtures.pose_worlds import random_poses
+from tests.fixtures.pose_worlds import from_first, random_poses
 
 CHAIN = {0: None, 1: 0, 2: 1}
 STAR = {0: None, 1: 0, 2: 0}
@@ -121,6 +122,10 @@ def test_from_far_away_too_the_team_ends_at_a_minimum(tree, seed):
     before = least_squares.cost(factors, start)
     assert least_squares.cost(factors, T) < before
     assert slope(factors, T) < 1e-2  # of some hundred at the start
+    central = solve_pose_graph(factors, start)
+    assert central.converged
+    assert least_squares.cost(factors, T) == pytest.approx(central.cost, rel=1e-6)
+    np.testing.assert_allclose(from_first(T), from_first(central.poses), atol=1e-6)
 
 
 def test_robots_move_alike_and_no_exchange_keeps_a_higher_cost():
