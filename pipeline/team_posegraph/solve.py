@@ -99,7 +99,7 @@ def _solved(graph: TeamGraph, path: Path, config: PoseGraphConfig) -> dict[str, 
     began = time.perf_counter()
     agents, traffic, rounds = meet(graph, config, lambda k, a, t: _watch(components, k, a, t, c2=c2))
     seconds = time.perf_counter() - began
-    results = [_result(component, agents, config, c2) for component in components]
+    results = [_result(component, agents, c2) for component in components]
     return _summary(
         graph, path, config, results, agents=agents, traffic=traffic, rounds=rounds, seconds=seconds
     )
@@ -185,9 +185,7 @@ def _watch(
         component.trace.append((k, component.cost(T, c2), sent))
 
 
-def _result(
-    component: _Component, agents: dict[str, PoseGraphAgent], config: PoseGraphConfig, c2: float | None
-) -> dict[str, Any]:
+def _result(component: _Component, agents: dict[str, PoseGraphAgent], c2: float | None) -> dict[str, Any]:
     """What one component reached."""
     members = [agents[name] for name in component.robots]
     T = np.concatenate([agent.T_world_keyframe for agent in members])
