@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.evaluation import network
+from duagc.pipeline.evaluation import coverage, network, oracle
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.exchange.wire.state_wire import PairList, write_pairs
 
@@ -54,3 +54,29 @@ def test_of_several_lists_of_a_pair_the_newest_counts(monkeypatch: pytest.Monkey
     assert session.rejected_matches_share() == 0.0
     session.run.robots["bravo"].rejected_matches = {("alpha", "bravo"): np.array([[30, 7]])}  # type: ignore
     assert session.rejected_matches_share() == 0.5
+
+
+def test_the_gap_of_gaussians_is_the_largest_and_its_99th_percentile(monkeypatch: pytest.MonkeyPatch) -> None:
+    gaps = {"alpha": np.arange(0.0, 60.0), "bravo": np.arange(60.0, 101.0)}
+    monkeypatch.setattr(oracle, "pose_gap", lambda *_: (0.25, 0.5))
+    monkeypatch.setattr(oracle, "_map_of", lambda robot: ())
+    for name in ("shared_evidence", "in_world", "used_matches"):
+        monkeypatch.setattr(oracle, name, lambda *_, **__: None)
+    monkeypatch.setattr(oracle, "_gaussian_gaps", lambda run, name, *_, **__: gaps[name])
+    session = session_of("alpha", "bravo")
+    central = dict.fromkeys(("alpha", "bravo"), np.eye(4))
+    pairs = {("alpha", "bravo"): np.zeros((0, 2), np.int64)}
+    found = oracle._gap(session.run, ["alpha", "bravo"], {}, central, pairs=pairs)
+    assert found == oracle.Gap(0.25, 0.5, 100.0, 99.0)
+
+
+def test_a_robot_whose_map_names_no_submap_has_one() -> None:
+    frame = SimpleNamespace(frame_index=0, status="tracked", reason="")
+    parts = {
+        "alpha": SimpleNamespace(frames=[frame], submaps=(), component=("alpha",)),
+        "bravo": SimpleNamespace(frames=[frame], submaps=(1, 2), component=("bravo",)),
+        "bravo-2": SimpleNamespace(frames=[frame], submaps=(1,), component=("bravo-2",)),
+    }
+    found = coverage.of_robots(SimpleNamespace(robots=parts, unmapped={}))  # type: ignore[arg-type]
+    assert {robot: row["submaps"] for robot, row in found.items()} == {"alpha": 1, "bravo": 3}
+    assert {robot: row["components"] for robot, row in found.items()} == {"alpha": 1, "bravo": 2}
