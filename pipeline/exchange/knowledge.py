@@ -74,7 +74,9 @@ class Knowledge:
         """
         if complete:
             self.incoming.pop((provider, message), None)
-        owner, body, records = evidence_wire.read_evidence(self.kind, payload, self.team)
+            owner, body, records = evidence_wire.read_evidence(self.kind, payload, self.team)
+        else:
+            owner = evidence_wire.check_chunk(self.kind, payload, self.team)
         if owner == self.own:
             raise MalformedError("evidence: a neighbor speaks for this robot")
         if not complete:

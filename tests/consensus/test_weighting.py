@@ -63,11 +63,11 @@ def test_what_each_kind_keeps() -> None:
     np.testing.assert_allclose(
         shape, np.tile(np.eye(6) / UNIT_SIGMA_SHAPE**2, (len(gaussians), 1, 1)), atol=1e-9
     )
-    told = told_in_map(0, "scalar")[0]
+    scalar = told_in_map(0, "scalar")[0]
     of_shape = np.diagonal(full.shape_information(), axis1=1, axis2=2).mean(axis=1)
-    np.testing.assert_allclose(told.shape_information(), of_shape[:, None, None] * np.eye(6), atol=1e-9)
+    np.testing.assert_allclose(scalar.shape_information(), of_shape[:, None, None] * np.eye(6), atol=1e-9)
     of_color = full.color_information().mean(axis=1)
-    np.testing.assert_allclose(told.color_information(), np.repeat(of_color[:, None], 3, axis=1))
+    np.testing.assert_allclose(scalar.color_information(), np.repeat(of_color[:, None], 3, axis=1))
 
 
 @pytest.mark.parametrize("kind", get_args(WeightKind))

@@ -1,9 +1,13 @@
 """Evidence in few bytes at the ends of its numbers: what does not fit is sent as the nearest that does."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
 from duagc.pipeline.exchange.wire import compact_wire, evidence_wire
+from duagc.pipeline.network.packets import EVIDENCE_KINDS, Kind, MalformedError
 from duagc.pipeline.splat.information import (
     COLOR,
     COLOR_INFORMATION,
@@ -41,3 +45,33 @@ def test_information_beyond_its_field_is_the_most_that_it_holds() -> None:
     np.testing.assert_allclose(information[:, COLOR_INFORMATION], LARGEST_ROOT**2, rtol=1e-6)
     np.testing.assert_allclose(information[:, OPACITY_INFORMATION], LARGEST_ROOT**2, rtol=1e-6)
     np.testing.assert_allclose(mean_block(information)[0], (16 * LARGEST_ROOT) ** 2 * np.eye(3), rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", sorted(EVIDENCE_KINDS))
+def test_a_chunk_is_refused_for_the_same_reasons_before_and_when_it_is_read(kind: Kind) -> None:
+    """A chunk on its arrival is checked, not read: what is found wrong must be the same, whatever byte is changed."""
+    rng = np.random.default_rng(0)
+    records = np.zeros(3, evidence_wire.record_dtype(kind))
+    records["id"], records["theta"] = np.arange(3), rng.normal(size=(3, 13))
+    records["information"][:, :6] = pack_symmetric(np.eye(3)[None])
+    records["information"][:, 6:27] = pack_symmetric(np.eye(6)[None])
+    data = evidence_wire.write_evidence(kind, 1, "blended", evidence_wire.to_body(kind, records))
+
+    def outcome(read: Callable[[Kind, bytes, int], Any], changed: bytes) -> str:
+        try:
+            found = read(kind, changed, 3)
+        except MalformedError as error:
+            return str(error)
+        return f"of {found if isinstance(found, int) else found[0]}"
+
+    refused = set()
+    for at in range(len(data)):
+        for value in (0, 1, 127, 128, 252, 255):
+            changed = data[:at] + bytes([value]) + data[at + 1 :]
+            said = outcome(evidence_wire.check_chunk, changed)
+            assert said == outcome(evidence_wire.read_evidence, changed)
+            refused.add(said)
+    assert {"of 0", "of 1"} <= refused
+    assert len(refused) > 5
+    for short in (b"", data[:5], data[:-1], data + b"\0"):
+        assert outcome(evidence_wire.check_chunk, short) == outcome(evidence_wire.read_evidence, short)

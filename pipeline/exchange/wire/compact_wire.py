@@ -88,12 +88,13 @@ def encode(records: NDArray[Any]) -> NDArray[Any]:
     return out
 
 
-def decode(compact: NDArray[Any], record: np.dtype[Any]) -> NDArray[Any]:
+def decode(compact: NDArray[Any], record: np.dtype[Any], *, information: bool = True) -> NDArray[Any]:
     """Records of dtype `record` (`evidence_wire.RECORD`) from compact ones.
 
     Args:
         compact: [n] of `COMPACT`.
         record: dtype of the result.
+        information: also that; else it is zero.
 
     Returns:
         [n] of `record`, in the same order and frames.
@@ -104,6 +105,8 @@ def decode(compact: NDArray[Any], record: np.dtype[Any]) -> NDArray[Any]:
     out["theta"][:, LOG_COVARIANCE] = compact["shape"] * SHAPE_STEP
     out["theta"][:, COLOR] = compact["color"] * COLOR_STEP
     out["theta"][:, OPACITY] = compact["opacity"] * OPACITY_STEP
+    if not information:
+        return out
     position = _product(compact["position_factor"].astype(np.float64) * POSITION_UNIT, 3)
     out["information"][:, MEAN_INFORMATION] = pack_symmetric(position)
     out["information"][:, LOG_COVARIANCE_INFORMATION] = pack_symmetric(

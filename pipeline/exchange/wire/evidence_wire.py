@@ -167,6 +167,34 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
     Raises:
         MalformedError: it is not what it should be, or of a robot outside the team.
     """
+    owner, body = _read_body(kind, data, team)
+    records = from_body(kind, body)
+    check_evidence(records)
+    if kind is not Kind.EVIDENCE:  # the factors of the compact kind are always possible
+        check_information(records["information"].astype(np.float64))
+    return owner, body, records
+
+
+def check_chunk(kind: Kind, chunk: bytes, team: int) -> int:
+    """Owner of one chunk of a message that is read when all of it is here.
+
+    Args:
+        kind: of the evidence.
+        chunk: as it came in a packet.
+        team: number of robots.
+
+    Raises:
+        MalformedError: `read_evidence` would refuse it.
+    """
+    if kind is not Kind.EVIDENCE:
+        return read_evidence(kind, chunk, team)[0]
+    owner, body = _read_body(kind, chunk, team)
+    check_evidence(decode(body, RECORD, information=False))
+    return owner
+
+
+def _read_body(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]]:
+    """Owner of consecutive chunks, and their records as they were sent, of finite numbers; as `read_evidence`."""
     owner, _, announced = read_evidence_head(kind, data[:EVIDENCE_HEAD_BYTES], team)
     step = chunk_bytes(kind)
     chunks = -(-len(data) // step)
@@ -183,11 +211,7 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
     for name in body.dtype.names or ():
         if body[name].dtype.kind == "f" and not np.isfinite(body[name]).all():
             raise MalformedError("evidence: not a finite number")
-    records = from_body(kind, body)
-    check_evidence(records)
-    if kind is not Kind.EVIDENCE:  # the factors of the compact kind are always possible
-        check_information(records["information"].astype(np.float64))
-    return owner, body, records
+    return owner, body
 
 
 def check_evidence(records: NDArray[Any]) -> None:
