@@ -116,9 +116,7 @@ class TreeNode:
         self._damping = self._damped = 0.0
         self._moved_rad = self._step_before = np.inf  # since the last linearization; of the exchange before
         self._cost: float | None = None  # at the root: of the last accepted poses
-        self._returned = (
-            False  # at the root: the last step was refused, and all robots are where they were before it
-        )
+        self._returned = False  # at the root: the last step was refused, all are where they were before it
         self._sent = -1  # exchange whose block went up
 
     # --- messages
