@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from duagc.converters.layouts.ros_images import encoded_size
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import decode_image, read_bytes
-from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.base import Config, expected_of
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.recording.greatest_depth import without_saturated
 
@@ -44,7 +44,7 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
             raise DuagError(f"{dataset}: {name} is no option; {hint}") from error
         if not first["loc"]:  # of several options together
             raise DuagError(f"{dataset}: {first['ctx']['error']}") from error
-        raise DuagError(f"{dataset}: {name} = {first['input']!r}: {first['msg']}") from error
+        raise DuagError(f"{dataset}: {name} = {first['input']!r}: {expected_of(first)}") from error
 
 
 def image_size(path: Path) -> tuple[int, int]:

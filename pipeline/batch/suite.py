@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_toml
-from duagc.pipeline.config.base import Config, load_config
+from duagc.pipeline.config.base import Config, expected_of, load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.run_plan import LAST, NAMES
 
@@ -133,7 +133,8 @@ def _complaint(error: ValidationError) -> str:
     first = error.errors()[0]
     *section, name = map(str, first["loc"])
     if first["type"] != "extra_forbidden":
-        return f"{'.'.join([*section, name])}: {first['msg']}"
+        found = "" if first["type"] == "missing" else f" = {first['input']!r}"
+        return f"{'.'.join([*section, name])}{found}: {expected_of(first)}"
     models: dict[str, type[Config]] = {"configurations": SuiteConfiguration, "exclude": Exclusion}
     model = models[section[0]] if section else SuiteFile
     return f"{'.'.join([*section, name])} is unknown, {closest(name, list(model.model_fields), 'a name')}"

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_toml
 from duagc.pipeline.comparison.fields import Unequal
-from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.base import Config, expected_of
 
 
 class Tolerance(Config):
@@ -75,7 +75,9 @@ def read_tolerances(path: Path) -> Tolerances:
         except ValidationError as error:
             first = error.errors()[0]
             name = ".".join(map(str, first["loc"]))
-            hint = closest(name, known, "a field") if first["type"] == "extra_forbidden" else first["msg"]
+            hint = (
+                closest(name, known, "a field") if first["type"] == "extra_forbidden" else expected_of(first)
+            )
             raise DuagError(f"{path}: tolerance {number}: {name}: {hint}") from error
         if not out[-1].reason.strip():
             raise DuagError(f"{path}: tolerance {number}: reason is empty, expected why this much is right")

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import sys
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,12 +12,10 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_toml
-
-EXPECTED = {"tuple_type": "expected a list in brackets, such as [1, 2], texts in quotes"}
-"""What is said of a wrong value in place of pydantic's words, by the type of its error."""
 
 
 class Config(BaseModel):
@@ -69,6 +68,16 @@ def _documented(module: str) -> dict[str, dict[str, str]]:
 LARGEST = 2**62
 """Of numbers; as nanoseconds 146 years."""
 
+EXPECTED = {
+    "tuple_type": "expected a list in brackets, such as [1, 2], texts in quotes",
+    "int_parsing_size": f"expected at most {LARGEST:g}",
+    "missing": "expected a value",
+}
+"""What is said of a wrong value in place of pydantic's words, by the type of its error."""
+
+MOST_SAID = 100
+"""Characters of an override that a message repeats."""
+
 Model = TypeVar("Model", bound=Config)
 
 
@@ -93,7 +102,7 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
         raise DuagError(f"{_said_where(name, source, overrides)}: {name} is true or false, expected a number")
     try:
         config = model.model_validate(values)
-        check_numbers(config, source)
+        check_numbers(config, source, overrides)
         return config
     except ValidationError as error:
         first = error.errors()[0]
@@ -106,8 +115,18 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
             ) from error
         if first["type"] == "value_error":
             raise DuagError(f"{source}: {first['ctx']['error']}") from error
-        complaint = EXPECTED.get(first["type"], first["msg"])
-        raise DuagError(f"{source}: {name} = {first['input']!r}: {complaint}") from error
+        raise DuagError(f"{source}: {name} = {first['input']!r}: {expected_of(first)}") from error
+
+
+def expected_of(complaint: ErrorDetails) -> str:
+    """What pydantic expected in place of a wrong value, in the words of every other message.
+
+    Args:
+        complaint: one of `ValidationError.errors()`.
+    """
+    message = complaint["msg"].replace("Input should be", "expected", 1)
+    message = re.sub("^expected (greater|less) than", r"expected a number \1 than", message)
+    return EXPECTED.get(complaint["type"], message)
 
 
 def _said_where(name: str, source: str, overrides: Sequence[str]) -> str:
@@ -115,7 +134,7 @@ def _said_where(name: str, source: str, overrides: Sequence[str]) -> str:
     for override in reversed(overrides):
         said = f"{override.partition('=')[0].strip()}."
         if said.startswith(f"{name}.") or f"{name}.".startswith(said):
-            return f"--set {override}"
+            return f"--set {override if len(override) <= MOST_SAID else override[:MOST_SAID] + ' ...'}"
     return source
 
 
@@ -130,29 +149,31 @@ def _booleans_for_numbers(model: type[Config], values: Mapping[str, Any], prefix
             yield f"{prefix}{name}"
 
 
-def check_numbers(config: Config, source: str, prefix: str = "") -> None:
+def check_numbers(config: Config, source: str, overrides: Sequence[str] = (), prefix: str = "") -> None:
     """Refuse numbers below 0 where a setting says nothing else, numbers that no machine holds, and lists of none.
 
     Args:
         config: settings.
         source: where they are said, for the message.
+        overrides: `section.name=value`, of which one may say a number instead.
         prefix: of their names.
 
     Raises:
         DuagError: names the setting, what was found and what was expected.
     """
     for name, field in type(config).model_fields.items():
-        value, where = getattr(config, name), f"{source}: {prefix}{name}"
-        if isinstance(value, tuple) and not value and field.default:
-            raise DuagError(f"{where} is empty, expected one value or more")
+        value, full = getattr(config, name), f"{prefix}{name}"
+        wrong = "is empty, expected one value or more" if value == () and field.default else None
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, Config):
-                check_numbers(number, source, f"{prefix}{name}.")
+                check_numbers(number, source, overrides, f"{full}.")
             elif isinstance(number, int | float):
                 if number < 0 and not field.metadata:
-                    raise DuagError(f"{where} is {_short(number)}, expected 0 or more")
-                if abs(number) > LARGEST:
-                    raise DuagError(f"{where} is {_short(number)}, expected at most {LARGEST:g}")
+                    wrong = f"is {_short(number)}, expected 0 or more"
+                elif abs(number) > LARGEST:
+                    wrong = f"is {_short(number)}, expected at most {LARGEST:g}"
+        if wrong is not None:
+            raise DuagError(f"{_said_where(full, source, overrides)}: {full} {wrong}")
 
 
 def _short(number: int | float) -> str:

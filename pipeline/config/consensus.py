@@ -109,7 +109,9 @@ class PoseConsensusConfig(Config):
     def _consistent(self) -> PoseConsensusConfig:
         first, last = self.robust_mu
         if not 0 < first <= last:
-            raise ValueError(f"consensus.robust_mu is [{first:g}, {last:g}], expected 0 < first <= last")
+            raise ValueError(
+                f"exchange.consensus.robust_mu is [{first:g}, {last:g}], expected 0 < first <= last"
+            )
         return self
 
     def team_schedule(self) -> TeamSchedule:

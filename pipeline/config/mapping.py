@@ -74,7 +74,9 @@ class SeedingConfig(Config):
     @classmethod
     def _halves(cls, sides: tuple[int, ...]) -> tuple[int, ...]:
         if not sides or any(coarse != 2 * fine for coarse, fine in pairwise(sides)):
-            raise ValueError(f"{list(sides)}, expected sides of cells, each half of the one before")
+            raise ValueError(
+                f"frontend.mapping.seeding.cell_sizes_px is {list(sides)}, expected each half of the one before"
+            )
         return sides
 
 
@@ -166,7 +168,7 @@ class MappingConfig(Config):
     not at all; or, where it states nothing, estimated from the images, which takes about a third longer."""
     stable_steps: int = Field(default=0, ge=0, le=1023)
     """Steps after which a Gaussian is stable: frozen until the final optimization; 0: never."""
-    depth: DepthKind | Literal["auto"] = "auto"
+    depth: Literal[DepthKind, "auto"] = "auto"
     """Depth of a Gaussian at a pixel: that of its center (`blended`), or of its disc along the ray (`ray_plane`).
     `auto`: `ray_plane` where the measured noise of the depth images is below `exact_depth_m`."""
     exact_depth_m: float = Field(default=0.002, ge=0.0)

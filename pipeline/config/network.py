@@ -74,7 +74,9 @@ class LinkConfig(Config):
             raise ValueError("exchange.link: topology 'range' expects range_m above 0 and waypoints")
         for window in self.windows:
             if window.sender == window.receiver:
-                raise ValueError(f"exchange.link.windows: {window.sender} is linked to itself")
+                raise ValueError(
+                    f"exchange.link.windows: {window.sender} to {window.receiver}, expected different robots"
+                )
             if window.until_ns is not None and window.until_ns <= window.from_ns:
                 raise ValueError(
                     f"exchange.link.windows: {window.sender} to {window.receiver} ends at {window.until_ns} ns, "

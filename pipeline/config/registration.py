@@ -108,7 +108,7 @@ class GicpConfig(Config):
 
     voxel_m: float = Field(default=0.03, gt=0.0)
     """Edge of the voxels that either view's points are thinned to."""
-    distances_m: tuple[float, ...] = Field(default=(1.0, 0.3, 0.1), min_length=1)
+    distances_m: tuple[float, ...] = (1.0, 0.3, 0.1)
     """Distances below which points correspond, one run each."""
     iterations: int = Field(default=30, ge=1)
     """Most steps of each run."""

@@ -18,7 +18,7 @@ from duagc.converters.simulate.sensors.rig import Rig
 from duagc.converters.simulate.settings import SimulationSettings
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import parse_toml, read_text
-from duagc.pipeline.config.base import Config, load_config
+from duagc.pipeline.config.base import Config, expected_of, load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.experiments.metric_names import check_metric
 from duagc.pipeline.experiments.statistics import MOST_EXACT
@@ -244,7 +244,7 @@ def data_of(experiment: ExperimentFile, profile: Profile, configuration: str) ->
 
 def _complaint(error: ValidationError) -> str:
     first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    return f"{'.'.join(map(str, first['loc']))}: {expected_of(first)}"
 
 
 def _check(path: Path, file: ExperimentFile) -> None:

@@ -141,7 +141,7 @@ def test_tolerances_count_per_field_and_have_reasons(
             row.format(0.02).replace("absolute", "absolutes"),
             "tolerance 1: absolutes: expected perhaps absolute",
         ),
-        (row.format(-1), "tolerance 1: absolute: Input should be greater than or equal to 0"),
+        (row.format(-1), "tolerance 1: absolute: expected a number greater than or equal to 0"),
         (row.format(0.02).replace("tolerance", "tolerances"), r"expected \[\[tolerance\]\] tables only"),
         ("[[tolerance", "not valid TOML"),
     ):

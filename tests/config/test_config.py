@@ -1,5 +1,7 @@
 """Configuration files: round trip, overrides, and errors that name what is wrong."""
 
+import re
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import get_args
@@ -141,6 +143,34 @@ def test_what_is_wrong_is_in_the_file_or_in_an_override(tmp_path: Path) -> None:
         load_config(Whole, path, ["link.loss_probability=most"])
     with pytest.raises(DuagError, match=r"^--set lnk.name=a: lnk is not a known setting"):
         load_config(Whole, overrides=["lnk.name=a", "seed=4"])
+
+
+def names(model: type[Config], prefix: str = "") -> Iterator[str]:
+    """Dotted names of all settings of a configuration."""
+    for name, field in model.model_fields.items():
+        section = field.annotation
+        if isinstance(section, type) and issubclass(section, Config):
+            yield from names(section, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"
+
+
+@pytest.mark.parametrize("value", ["no_such_thing", "-1", "[]", "nan", "{}", "1e300"])
+def test_a_wrong_value_of_any_setting_is_said_alike(value: str) -> None:
+    """With the override that says it, the setting as it is written, what was found and what was expected."""
+    refused = 0
+    for name in names(RunConfig):
+        try:
+            load_config(RunConfig, overrides=[f"{name}={value}"])
+        except DuagError as error:
+            refused += 1
+            said, override = str(error), f"--set {name}={value}: "
+            assert said.startswith(override), said
+            if not name.startswith(("exchange.link.", "exchange.injection.")):  # also judged together
+                assert re.match(
+                    rf"{re.escape(name)}(\.\d+)? (= .*:|is .*,) expected ", said[len(override) :]
+                ), said
+    assert refused > 100 or value in ("[]",), refused
 
 
 @pytest.mark.parametrize(

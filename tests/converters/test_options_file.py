@@ -84,7 +84,10 @@ def test_every_converter_has_its_options_in_a_file(dataset: str, tmp_path: Path)
     ("content", "message"),
     [
         ("color_focal_px = 520", "nothing_here/seq: no such folder"),  # sound
-        ("color_focal_px = 0", r"wrong.toml, for 7scenes: color_focal_px = 0: Input should be greater"),
+        (
+            "color_focal_px = 0",
+            r"wrong.toml, for 7scenes: color_focal_px = 0: expected a number greater than 0",
+        ),
         ("color_focal = 520", r"for 7scenes: color_focal is no option; expected perhaps color_focal_"),
         ("[camera]\nfx = 1", r"wrong.toml, for 7scenes: camera is no option"),
         ('color_rotation_rad = "1 2"', "wrong.toml, for 7scenes: color_rotation_rad = '1 2'.*expected 3"),

@@ -217,7 +217,7 @@ def test_links_survive_a_configuration_file(tmp_path: Path) -> None:
     [
         ({"topology": "listed"}, "windows is empty"),
         ({"topology": "range"}, "expects range_m above 0 and waypoints"),
-        ({"windows": ({"sender": "a", "receiver": "a"},)}, "linked to itself"),
+        ({"windows": ({"sender": "a", "receiver": "a"},)}, "a to a, expected different robots"),
         (
             {"windows": ({"sender": "a", "receiver": "b", "from_ns": 5, "until_ns": 5},)},
             "expected later than 5 ns",

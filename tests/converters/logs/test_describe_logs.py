@@ -187,7 +187,7 @@ def test_what_is_not_decided_lists_its_candidates(tmp_path: Path) -> None:
         ),
         (
             '[robots.a]\nlogs = ["a.mcap"]\ndepth_scale = -1\n',
-            r"\[robots.a\]: depth_scale = -1: Input should be greater",
+            r"\[robots.a\]: depth_scale = -1: expected a number greater than 0",
         ),
         ('time_source = "hedaer"\n[robots.a]\nlogs = ["a.mcap"]\n', "time_source = 'hedaer'"),
         ('pieces = true\n[robots.a]\nlogs = ["a.mcap"]\n', "pieces is said, expected `logs`"),
