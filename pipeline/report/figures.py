@@ -255,7 +255,7 @@ def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
         axes.plot(span, span, color=FAINT, linewidth=1.0, linestyle=(0, (1, 2)), label="right prediction")
         for axis in (axes.xaxis, axes.yaxis):
             axis.axes.set(**{f"{axis.axis_name}scale": "log"})
-            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if span[1] < 1e3 * span[0] else (1.0,)))
             axis.set_major_formatter(FormatStrFormatter("%g"))
             axis.set_minor_formatter(NullFormatter())
     for i, (name, pairs) in enumerate(bins.items()):

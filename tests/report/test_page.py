@@ -1,6 +1,7 @@
 import json
 import re
 from html import unescape
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -239,6 +240,18 @@ def test_long_names_leave_room_for_the_axes():
     for svg in drawn:
         assert all(f">{name}<" not in svg for name in names)
         assert "robot_…oor_3" in svg
+
+
+@pytest.mark.parametrize("largest_m", [1e-2, 0.2, 0.4, 6.0, 900.0])
+def test_labels_of_predicted_errors_stay_apart(largest_m):
+    """One Gaussian that nothing determines makes the axes long."""
+    svg = figures.reliability({"alpha": [(3e-4, 1e-3), (largest_m, 7e-3)]})
+    labels = re.findall(r'text-anchor: middle[^>]* x="([\d.]+)" [^>]*>([\d.e+-]+)</text>', svg)
+    ends = sorted(
+        (float(x) - 3.2 * len(text), float(x) + 3.2 * len(text)) for x, text in labels
+    )  # 10 px high
+    assert len(ends) >= 3
+    assert all(end + 3.0 < start for (_, end), (start, _) in pairwise(ends)), labels
 
 
 def test_bars_of_names_that_look_alike_stay_apart():
