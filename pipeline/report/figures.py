@@ -144,6 +144,7 @@ def lines(
     *,
     log: bool = False,
     level: float | None = None,
+    robots: Sequence[str] = (),
 ) -> Figure:
     """Curves over a common axis.
 
@@ -153,12 +154,14 @@ def lines(
         y_label: of the other axis.
         log: logarithmic y axis; values that are not positive are left out.
         level: a horizontal line to compare with, for example a tolerance.
+        robots: all of the team, also those without a curve: each has the color of its place.
     """
     from matplotlib.ticker import MaxNLocator
 
     figure, axes = _figure(5.4, 3.2)
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-    for i, (name, (x, y)) in enumerate(series.items()):
+    for place, (name, (x, y)) in enumerate(series.items()):
+        i = robots.index(name) if name in robots else place
         x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         keep = np.isfinite(y) & ((y > 0) | (not log))
         axes.plot(
@@ -240,11 +243,12 @@ def bars(names: Sequence[str], parts: Mapping[str, Sequence[float]], x_label: st
 
 
 @_styled
-def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
+def reliability(bins: Mapping[str, Sequence[tuple[float, float]]], robots: Sequence[str] = ()) -> Figure:
     """Predicted against observed error per decile, millimeters, both axes logarithmic; the diagonal is right.
 
     Args:
         bins: (predicted, observed) error of every decile, meters, by robot.
+        robots: all of the team, also those without a decile: each has the color of its place.
     """
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
@@ -258,7 +262,8 @@ def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if span[1] < 1e3 * span[0] else (1.0,)))
             axis.set_major_formatter(FormatStrFormatter("%g"))
             axis.set_minor_formatter(NullFormatter())
-    for i, (name, pairs) in enumerate(bins.items()):
+    for place, (name, pairs) in enumerate(bins.items()):
+        i = robots.index(name) if name in robots else place
         x, y = 1e3 * np.array(pairs).T
         axes.plot(x, y, color=color_of(i), marker=MARKS[i % len(MARKS)], markersize=5, label=shortened(name))
     axes.set_xlabel("predicted error (mm, root mean square)")

@@ -259,7 +259,11 @@ def _agreement_content(
     charts = [
         {
             "title": title,
-            "uri": pictures.svg_uri(figures.lines(series[name], "round", "m or rad", log=True, level=level)),
+            "uri": pictures.svg_uri(
+                figures.lines(
+                    series[name], "round", "m or rad", log=True, level=level, robots=list(session.run.robots)
+                )
+            ),
         }
         for title, name, level in (
             ("Largest change of a pose in a round", "change", tolerance),
@@ -328,7 +332,7 @@ def _reliability_chart(run: RunFolder) -> str:
         robot: [(decile["predicted_rms_m"], decile["observed_rms_m"]) for decile in deciles.values()]
         for robot, deciles in bins.items()
     }
-    return pictures.svg_uri(figures.reliability(curves))
+    return pictures.svg_uri(figures.reliability(curves, list(run.robots)))
 
 
 # --- time and the rest -------------------------------------------------------------------------------------------

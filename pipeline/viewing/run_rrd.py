@@ -220,14 +220,16 @@ def _log_rounds(stream: rr.RecordingStream, session: Session) -> None:
     """
     import rerun as rr
 
+    robots = list(session.run.robots)
     end_ns = max(int(robot.trajectory.stamps_ns[-1]) for robot in session.run.robots.values())
     for group, series in session.series_by_round().items():
-        for name, (rounds, values) in series.items():
+        for i, (name, (rounds, values)) in enumerate(series.items()):
+            color = rgba(color_of(robots.index(name) if name in robots else i) + "ff")
             if group != "bytes":
                 keep = values > 0
                 rounds, values = rounds[keep], np.log10(values[keep])
             entity = f"rounds/{group}/{name}"
-            stream.log(entity, rr.SeriesLines(names=name), static=True)
+            stream.log(entity, rr.SeriesLines(names=name, colors=[color]), static=True)
             times = np.asarray(end_ns + (rounds + 1) * session.period_ns, dtype="timedelta64[ns]")
             stream.send_columns(
                 entity,

@@ -242,6 +242,15 @@ def test_long_names_leave_room_for_the_axes():
         assert "robot_…oor_3" in svg
 
 
+def test_a_robot_keeps_its_color_where_another_has_no_curve():
+    """That of its place in the team, as in the paths and in the table of the robots."""
+    x, team = np.arange(4.0), ["alpha", "bravo", "charlie"]
+    svg = figures.lines({"bravo": (x, x + 1)}, "round", "m", robots=team)
+    other = figures.reliability({"charlie": [(1e-3, 2e-3), (2e-3, 2e-3)]}, team)
+    for drawn, place in ((svg, 1), (other, 2)):
+        assert [figures.color_of(i) in drawn.upper() for i in range(3)] == [i == place for i in range(3)]
+
+
 @pytest.mark.parametrize("largest_m", [1e-2, 0.2, 0.4, 6.0, 900.0])
 def test_labels_of_predicted_errors_stay_apart(largest_m):
     """One Gaussian that nothing determines makes the axes long."""

@@ -130,6 +130,24 @@ def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
     assert not (tmp_path / "run.rrd.part").exists()
 
 
+def test_a_robot_has_one_color_in_paths_plots_and_network(fake, tmp_path):
+    from rerun.chunk import RrdReader
+
+    found: dict[tuple[str, str], list] = {}
+    reader = RrdReader(run_rrd.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
+    for chunk in reader.stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.endswith(":colors"):
+                found[chunk.entity_path, name] = batch.column(name).to_pylist()[0]
+    nodes = found["/network", "GraphNodes:colors"]
+    for i, robot in enumerate(("alpha", "bravo")):
+        assert found[f"/world/paths/{robot}/after_consensus", "LineStrips3D:colors"] == [nodes[i]]
+        assert found[f"/rounds/change/{robot}", "SeriesLines:colors"] == [nodes[i]]
+    drawn = [tuple(colors) for (entity, _), colors in found.items() if entity.startswith("/rounds/bytes/")]
+    assert len(set(drawn)) == len(drawn) >= 2
+
+
 def test_gaussians_are_colored_by_the_decade_of_sigma_and_gray_where_it_is_not_determined():
     colors = run_rrd.sigma_colors(np.array([0.001, 0.01, 0.1, np.inf]))
     assert colors[3].tolist() == [0.75] * 3
