@@ -241,7 +241,7 @@ def test_pages_that_the_code_names_exist() -> None:
 def test_the_tutorial_explains_every_verdict() -> None:
     text = (DOCS / "tutorial" / "your-bag.md").read_text(encoding="utf-8")
     verdicts = {verdict.value for verdict in Verdict}
-    rows = re.findall(r"^alpha  bravo .*? (?:–|\d\.\d+)  +(.*?)  ", text, re.MULTILINE)
+    rows = re.findall(r"^bravo  alpha .*? (?:–|\d\.\d+)  +(.*?)  ", text, re.MULTILINE)
     assert len(rows) >= 3
     assert set(rows) <= verdicts
     assert set(re.findall(r"^\| ([^`|]*?) \|", text, re.MULTILINE)) >= verdicts - {Verdict.KEPT.value}

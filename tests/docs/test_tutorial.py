@@ -40,7 +40,11 @@ def test_info_says_what_would_be_converted(folder: Path) -> None:
     text = duagc("info", folder / "bags")
     for robot in ("alpha", "bravo"):
         assert f"robot {robot}: " in text
-    assert f"{FRAMES} frames, depth is registered to color already" in text
+    page = (ROOT / "docs" / "tutorial" / "your-bag.md").read_text(encoding="utf-8")
+    shown = page.partition("```text\nrobot alpha: bags/alpha.bag\n")[2].partition("```")[0].splitlines()
+    assert len(shown) == 5
+    for line in shown:
+        assert line.replace("100 frames", f"{FRAMES} frames") in text.splitlines()
 
 
 def test_check_warns_of_the_unit_of_depth_until_it_is_right(folder: Path) -> None:
