@@ -275,10 +275,10 @@ class TrackingConfig(Config):
     """Pixels between samples of a keyframe, per pyramid level, finest first."""
     max_extrapolation_s: float = 0.2
     """Longest gap in time over which the last velocity predicts; one and a half usual intervals if they are longer."""
-    equalize_from_gain: float = 1.2
+    equalize_from_gain: float = Field(default=1.2, ge=1.0)
     """A frame that failed is tried again with brightness and contrast brought to those of the keyframe if the contrast
     differs by more than this factor."""
-    max_keyframe_gain: float = 1.5
+    max_keyframe_gain: float = Field(default=1.5, ge=1.0)
     """A frame brighter or darker than its keyframe by more than this factor, or with a gray residual that would be too
     large for relocalization, becomes a keyframe only below `relocalization.min_overlap`, or where the exposure drifts,
     and only if little of it is saturated."""

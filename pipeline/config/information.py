@@ -24,7 +24,7 @@ class InformationConfig(Config):
     """Scale sigma(z) by the robust spread of the map's own depth residuals; recorded with the result."""
     depth_factor_min: float = 0.25
     """Least factor on sigma(z) by the residuals."""
-    depth_factor_max: float = 10.0
+    depth_factor_max: float = Field(default=10.0, gt=0.0)
     """Greatest factor on sigma(z) by the residuals."""
     correlation_px: int = Field(default=4, ge=0)
     """Residuals of pixels this far apart in u and v are correlated with each other: about the reach of a Gaussian. What

@@ -56,7 +56,7 @@ class SeedingConfig(Config):
     """Depth error above which a pixel is not explained, plus depth_error_relative times the depth."""
     depth_error_relative: float = 0.02
     """Share of the depth that is added to `depth_error_m`."""
-    opacity: float = 0.7
+    opacity: float = Field(default=0.7, gt=0.0, lt=1.0)
     """Initial opacity."""
     spread: float = 0.85
     """Standard deviation of a disc in units of its cell's side on the surface."""
@@ -177,7 +177,7 @@ class MappingConfig(Config):
     loss: MapLossConfig = MapLossConfig()
     seeding: SeedingConfig = SeedingConfig()
     far: FarDepthConfig = FarDepthConfig()
-    min_opacity: float = 0.03
+    min_opacity: float = Field(default=0.03, gt=0.0, lt=1.0)
     """Gaussians below are pruned."""
     max_scale_m: float = Field(default=0.25, gt=0.0)
     """Greatest standard deviation of a Gaussian, unless `max_scale_of_depth` allows more."""
@@ -191,9 +191,9 @@ class MappingConfig(Config):
     optimization: the squared change of images, in units of the noise below."""
     contribution_pixels: int = Field(default=20_000, ge=64)
     """It is measured in images that are halved, at least once, until they have no more pixels."""
-    contribution_color_sigma: float = 0.03
+    contribution_color_sigma: float = Field(default=0.03, gt=0.0)
     """Noise of colors (0..1) by which a change of an image is measured."""
-    contribution_depth_sigma_m: float = 0.02
+    contribution_depth_sigma_m: float = Field(default=0.02, gt=0.0)
     """Noise of depth by which a change of an image is measured."""
 
     def depth_kind(self, depth_noise_m: float | None, median_depth_m: float = math.inf) -> DepthKind:

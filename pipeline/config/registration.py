@@ -21,7 +21,7 @@ class RegistrationConfig(Config):
     normal_gate_rad: float = 0.0
     """Largest angle between the normals of a sample and of the surface it falls on; 0 = no test, the default, because
     normals of a structured-light camera scatter by more than any useful limit."""
-    huber_sigmas: float = 1.5
+    huber_sigmas: float = Field(default=1.5, gt=0.0)
     """Residuals beyond this many sigmas count linearly."""
     depth_sigma_base_m: float = 0.0012
     """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not hold it pixel by pixel; only its shape

@@ -15,15 +15,15 @@ DepthKind: TypeAlias = Literal["blended", "ray_plane"]
 class LossConfig(Config):
     """Weights of the mapping loss; every term is a mean over its pixels."""
 
-    color_huber: float = 0.1
+    color_huber: float = Field(default=0.1, ge=1e-9, le=1e9)
     """Color residual (0..1) where the loss turns from quadratic to linear; the slope beyond is 1."""
-    depth_weight: float = 1.0
+    depth_weight: float = Field(default=1.0, ge=0.0, le=1e9)
     """Weight of one meter of depth error against one unit of color."""
-    depth_huber_m: float = 0.02
+    depth_huber_m: float = Field(default=0.02, ge=1e-9, le=1e9)
     """Depth residual in meters where the loss turns from quadratic to linear; the slope beyond is 1."""
-    alpha_weight: float = 0.04
+    alpha_weight: float = Field(default=0.04, ge=0.0, le=1e9)
     """Weight of missing opacity (1 - alpha) where a surface was measured."""
-    surface_weight: float = 0.0
+    surface_weight: float = Field(default=0.0, ge=0.0, le=1e9)
     """Weight of one meter between a Gaussian's own depth and the measured one, by its share in the pixel."""
     depth_sigma_quadratic_per_m: float = Field(default=0.0019, ge=0.0)
     """Noise of depth of which the log states none, by the square of the distance; 0: none."""
@@ -32,13 +32,13 @@ class LossConfig(Config):
 class SurfaceLossConfig(LossConfig):
     """The same where depth is exact: every single Gaussian belongs on the surface."""
 
-    depth_weight: float = 0.25
+    depth_weight: float = Field(default=0.25, ge=0.0, le=1e9)
     """Weight of one meter of depth error against one unit of color."""
-    depth_huber_m: float = 0.01
+    depth_huber_m: float = Field(default=0.01, ge=1e-9, le=1e9)
     """Depth residual in meters where the loss turns from quadratic to linear; the slope beyond is 1."""
-    alpha_weight: float = 0.02
+    alpha_weight: float = Field(default=0.02, ge=0.0, le=1e9)
     """Weight of missing opacity (1 - alpha) where a surface was measured."""
-    surface_weight: float = 0.5
+    surface_weight: float = Field(default=0.5, ge=0.0, le=1e9)
     """Weight of one meter between a Gaussian's own depth and the measured one, by its share in the pixel."""
     depth_sigma_quadratic_per_m: float = Field(default=0.0, ge=0.0)
     """Noise of depth of which the log states none, by the square of the distance; 0: none."""

@@ -93,6 +93,31 @@ def test_a_section_is_introduced_by_its_first_paragraph() -> None:
     assert Whole.summary() == "All of it."
 
 
+@pytest.mark.parametrize(
+    "override",
+    [
+        "frontend.tracking.registration.huber_sigmas=0",
+        "exchange.verification.registration.huber_sigmas=0",
+        "frontend.tracking.equalize_from_gain=0.9",
+        "frontend.tracking.max_keyframe_gain=0",
+        "frontend.mapping.loss.blended.color_huber=0",
+        "frontend.mapping.loss.ray_plane.depth_huber_m=0",
+        "fusion.finetune.loss.blended.depth_weight=1e10",
+        "frontend.mapping.seeding.opacity=1",
+        "frontend.mapping.seeding.opacity=0",
+        "frontend.mapping.min_opacity=1",
+        "frontend.mapping.min_opacity=0",
+        "frontend.mapping.contribution_color_sigma=0",
+        "frontend.mapping.contribution_depth_sigma_m=0",
+        "information.depth_factor_max=0",
+    ],
+)
+def test_what_no_stage_can_compute_with_is_refused_before_it(override: str) -> None:
+    """Each of these ended in a traceback or a warning of a numeric library in the middle of a run."""
+    with pytest.raises(DuagError, match=f"^--set {override}: .* expected a number "):
+        load_config(RunConfig, overrides=[override])
+
+
 def test_a_number_for_a_list_is_refused_in_words_of_toml() -> None:
     with pytest.raises(DuagError, match=r"strides = 3: expected a list in brackets, such as \[1, 2\]"):
         load_config(RunConfig, overrides=["frontend.tracking.strides=3"])
