@@ -128,7 +128,11 @@ class Preview:
             _write(image, self.names[k][0], initial_px, color, scale=0.6, thickness=2)
         meters = 10.0 ** np.floor(np.log10(200 / scale))
         bottom = image.shape[0] - 14
-        cv2.line(image, (14, bottom), (14 + round(meters * scale), bottom), INK, 3)
+        right = 14 + round(meters * scale)
+        cv2.rectangle(
+            image, (6, bottom - 26), (max(right, 60) + 8, bottom + 8), PAPER, -1
+        )  # floors may be dark
+        cv2.line(image, (14, bottom), (right, bottom), INK, 3)
         _write(image, f"{meters:g} m", (14, bottom - 8), INK)
         return image
 

@@ -107,7 +107,7 @@ def simulate(
     settings.check()
     if scene not in SCENES:
         check_apart(Path(out), [Path(scene)])
-    _check_output(Path(out), workers, preview)
+    _check_output(Path(out), workers, preview, force)
     _check_paths(settings, paths)
     determinism.configure_determinism()
     determinism.configure_opencv()
@@ -358,14 +358,14 @@ def _check_paths(settings: SimulationSettings, paths: Sequence[Array] | None) ->
         raise DuagError(f"simulate: paths are of shapes {found}, expected {expected}")
 
 
-def _check_output(out: Path, workers: int, preview: Path | None) -> None:
+def _check_output(out: Path, workers: int, preview: Path | None, force: bool) -> None:
     """Refuse a number of workers or a picture that cannot be."""
     if not 1 <= workers <= MAX_WORKERS:
         raise DuagError(f"simulate: workers is {workers}, expected 1 to {MAX_WORKERS}")
     if preview is not None and resolved(out) in resolved(preview).parents:
         raise DuagError(f"{preview}: is inside the recording that is replaced, expected a picture elsewhere")
-    if preview is not None and preview.exists():
-        raise DuagError(f"{preview}: exists already, expected the name of a new picture")
+    if preview is not None and preview.exists() and not (force and preview.is_file()):
+        raise DuagError(f"{preview}: exists already, expected the name of a new picture, or --force")
     if preview is not None and (preview.suffix != ".png" or not preview.absolute().parent.is_dir()):
         raise DuagError(
             f"{preview}: found no such place for a picture, expected NAME.png in a folder that exists"

@@ -230,6 +230,18 @@ def test_a_picture_inside_the_recording_that_is_replaced_is_refused(folder, tmp_
         simulate(tmp_path / "rec", force=True, preview=tmp_path / "rec" / "p.png", **kind)
 
 
+def test_the_same_again_by_force_replaces_the_picture_too(folder, tmp_path):
+    kind = {"scene": str(folder), "robots": 1, "frames": 2, "size": (32, 32), "workers": 1}
+    out, sheet = tmp_path / "rec", tmp_path / "p.png"
+    simulate(out, preview=sheet, **kind)
+    first = sheet.read_bytes()
+    sheet.write_bytes(b"of another recording")
+    with pytest.raises(DuagError, match=r"p\.png: exists already, expected .* or --force"):
+        simulate(tmp_path / "other", preview=sheet, **kind)
+    simulate(out, preview=sheet, force=True, **kind)
+    assert sheet.read_bytes() == first
+
+
 def test_where_a_figure_fits_nowhere_is_said(room, monkeypatch):
     """Of the free floor a patch of half a meter is left."""
     space = room.free_space()
