@@ -91,6 +91,7 @@ def run(
     from duagc.pipeline.experiments.pages import PAGE, judge_folder, results_in, write_report
     from duagc.pipeline.experiments.predicted import predicted_each_s, time_left_s
     from duagc.pipeline.experiments.rule import experiment_names, read_experiment
+    from duagc.pipeline.time_left import in_words
 
     if engine not in ("local", "slurm", "ray"):
         raise typer.BadParameter(f"{engine!r} is not one of local, slurm, ray", param_hint="--engine")
@@ -112,10 +113,8 @@ def run(
     for number, experiment in enumerate(chosen, 1):
         begun = time.monotonic()
         if len(chosen) > 1:
-            left_min = time_left_s(predicted_s, took_s, workers) / 60
-            say(
-                f"{experiment.name}: experiment {number} of {len(chosen)}, about {left_min:.0f} min left in all"
-            )
+            left = in_words(time_left_s(predicted_s, took_s, workers))
+            say(f"{experiment.name}: experiment {number} of {len(chosen)}, about {left} left in all")
         with engine_of(engine, workers, out / experiment.name) as opened:
             failed += carry_out(
                 experiment,
@@ -160,9 +159,10 @@ def report(
 def _predicted(experiments: Sequence[Experiment], profile: str) -> str:
     """What experiments take, as text for people."""
     from duagc.pipeline.experiments.predicted import predicted_time
+    from duagc.pipeline.time_left import in_words
 
     took = predicted_time(experiments, profile)
-    return f"{took.runs} runs, {took.different} different, about {took.cpu_s / 3600:.1f} h of processor time"
+    return f"{took.runs} runs, {took.different} different, about {in_words(took.cpu_s)} of processor time"
 
 
 def _named_folder(text: str) -> tuple[str, Path]:

@@ -1,6 +1,7 @@
 """Experiments are read whole before anything runs; what they name exists."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -144,6 +145,9 @@ def test_the_commands_name_what_there_is(tmp_path: Path) -> None:
     assert [line.split()[0] for line in said.splitlines()] == experiment_names()
     shown = duagc_here("experiment", "show", "h1_team").stdout
     assert shown.endswith((RULES / "h1_team.toml").read_text())
+    assert re.search(
+        r"^# small: \d+ seeds, .*, about [1-9][\d.]* (s|min) of processor time$", shown, re.MULTILINE
+    )
     assert read_experiment("h1_team").sha256 in shown
     assert_one_line(duagc_here("experiment", "show", "h1_tean"), "expected perhaps h1_team")
     assert duagc_here("experiment", "run", "--out", tmp_path).returncode == 2
