@@ -151,7 +151,7 @@ def check_out(out: Path, force: bool, recording: dict[str, Any], folder: Path) -
         DuagError: no options take the calibration, or the file cannot be written.
     """
     if why := not_taken(recording):
-        raise DuagError(f"{folder}: {why}, for --out")
+        raise DuagError(f"{folder}: {why}, for --out; see --apply")
     if out.suffix != ".toml" or not out.absolute().parent.is_dir():
         raise DuagError(
             f"{out}: found no such place for a file of options, expected NAME.toml in a folder that exists"
