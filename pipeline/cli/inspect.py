@@ -26,6 +26,8 @@ def view(
     from duagc.pipeline.viewing import rerun_view
 
     rerun_view.view(path, save=save, screenshot=screenshot, recording=recording)
+    for written in filter(None, (save, screenshot)):
+        print(written)
 
 
 @app.command()

@@ -128,7 +128,9 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_measured(tm
             CliRunner().invoke(app, arguments, catch_exceptions=False)
         assert "\n" not in str(caught.value)
 
-    refused(tmp_path / "a.toml", "still: was made by , which takes no calibration, .*, for --out; see --apply")
+    refused(
+        tmp_path / "a.toml", "still: was made by , which takes no calibration, .*, for --out; see --apply"
+    )
     recorded.write_text(recorded.read_text().replace('"name": ""', '"name": "7scenes"', 1))
     refused(tmp_path / "a.json", "a.json: .* expected NAME.toml in a folder that exists")
     refused(tmp_path / "none" / "a.toml", "a.toml: .* expected NAME.toml in a folder that exists")

@@ -5,9 +5,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli import app
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import Lens
@@ -180,6 +182,15 @@ def test_a_made_file_is_copied_not_made_again(fake, tmp_path):
     rerun_view.view(fake.run, save=tmp_path / "copy.rrd")
     made.unlink()
     assert (tmp_path / "copy.rrd").read_bytes() == b"made before"
+
+
+def test_the_command_names_the_file_that_it_wrote(fake, tmp_path):
+    saved = tmp_path / "saved.rrd"
+    done = CliRunner().invoke(
+        app, ["view", str(fake.run), "--recording", str(fake.recording), "--save", str(saved)]
+    )
+    assert done.stdout == f"{saved}\n"
+    assert saved.is_file()
 
 
 def test_what_is_neither_a_run_nor_a_recording_is_an_error(tmp_path):
