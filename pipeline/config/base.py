@@ -72,6 +72,7 @@ EXPECTED = {
     "tuple_type": "expected a list in brackets, such as [1, 2], texts in quotes",
     "int_parsing_size": f"expected at most {LARGEST:g}",
     "missing": "expected a value",
+    "model_type": "expected a section of settings",
 }
 """What is said of a wrong value in place of pydantic's words, by the type of its error."""
 
@@ -105,7 +106,8 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
         check_numbers(config, source, overrides)
         return config
     except ValidationError as error:
-        first = error.errors()[0]
+        found = error.errors()
+        first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])
         name = ".".join(str(part) for part in first["loc"])
         source = _said_where(name, source, overrides)
         if first["type"] == "extra_forbidden":
@@ -115,7 +117,8 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
             ) from error
         if first["type"] == "value_error":
             raise DuagError(f"{source}: {first['ctx']['error']}") from error
-        raise DuagError(f"{source}: {name} = {first['input']!r}: {expected_of(first)}") from error
+        value = "is missing," if first["type"] == "missing" else f"= {first['input']!r}:"
+        raise DuagError(f"{source}: {name} {value} {expected_of(first)}") from error
 
 
 def expected_of(complaint: ErrorDetails) -> str:
@@ -188,18 +191,18 @@ def _short(number: int | float) -> str:
 
 def _nearest(model: type[Config], path: Sequence[str]) -> str:
     """What was perhaps meant by an unknown name: one of the same section, else the same name in another section."""
-    section: type[Any] | None = model
+    section: Any = model
     for part in path[:-1]:
-        field = (
-            section.model_fields.get(part) if section is not None and issubclass(section, Config) else None
-        )
-        section = field.annotation if field is not None and isinstance(field.annotation, type) else None
-    known = list(section.model_fields) if section is not None and issubclass(section, Config) else []
+        if part.isdecimal():  # of a list of sections
+            section = (*get_args(section), None)[0]
+        elif isinstance(section, type) and issubclass(section, Config):
+            section = field.annotation if (field := section.model_fields.get(part)) else None
+    known = list(section.model_fields) if isinstance(section, type) and issubclass(section, Config) else []
     said = closest(path[-1], known, "a setting")
     if said.startswith("expected perhaps"):
         return _prefixed(said, path[:-1])
     elsewhere = [name for name in _names(model) if name.rpartition(".")[2] == path[-1]]
-    return f"expected perhaps {elsewhere[0]}" if elsewhere else said
+    return f"expected perhaps {' or '.join(elsewhere[:3])}" if elsewhere else said
 
 
 def _prefixed(said: str, section: Sequence[str]) -> str:

@@ -170,6 +170,34 @@ def test_what_is_wrong_is_in_the_file_or_in_an_override(tmp_path: Path) -> None:
         load_config(Whole, overrides=["lnk.name=a", "seed=4"])
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("frontend = 3", "frontend = 3: expected a section of settings"),
+        (
+            '[[exchange.link.windows]]\nsender = "a"\nreceivers = "b"',
+            "exchange.link.windows.0.receivers is not a known setting, "
+            "expected perhaps exchange.link.windows.0.receiver;",
+        ),
+        (
+            '[[exchange.link.windows]]\nsender = "a"',
+            "exchange.link.windows.0.receiver is missing, expected a value",
+        ),
+        (
+            "max_gaussians = 3",
+            "max_gaussians is not a known setting, expected perhaps frontend.tracking.rendering.max_gaussians or "
+            "frontend.mapping.max_gaussians;",
+        ),
+    ],
+)
+def test_a_file_that_is_wrong_is_said_in_words_of_its_settings(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    with pytest.raises(DuagError) as caught:
+        load_config(RunConfig, path)
+    assert str(caught.value).startswith(f"{path}: {said}")
+
+
 def names(model: type[Config], prefix: str = "") -> Iterator[str]:
     """Dotted names of all settings of a configuration."""
     for name, field in model.model_fields.items():
