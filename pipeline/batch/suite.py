@@ -167,7 +167,10 @@ def _cells(path: Path, file: SuiteFile) -> Iterator[BatchCell]:
         if any(_applies(row, one) for row in file.exclude):
             continue
         settings = None if of_name.file is None else path.parent / of_name.file
-        config = load_config(RunConfig, settings, [*of_name.set, f"seed={seed}"])
+        try:
+            config = load_config(RunConfig, settings, [*of_name.set, f"seed={seed}"])
+        except DuagError as error:
+            raise DuagError(f"{path}: configuration {name}: {error}") from error
         yield BatchCell(
             recording_name, name, seed, folder=folders[recording_name], config=config, until=file.until
         )

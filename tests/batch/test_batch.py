@@ -90,7 +90,12 @@ def test_a_matrix_has_every_cell_with_its_settings(suite: Suite) -> None:
     ("old", "new", "complaint"),
     [
         ("wall = ", 'other = "nowhere"\nwall = ', "nowhere/recording.json: no such file"),
-        ("loss_probability", "loss_probabilty", "expected perhaps exchange.link.loss_probability"),
+        (
+            "loss_probability",
+            "loss_probabilty",
+            r"toml: configuration lossy: .* expected perhaps exchange.link.loss_probability",
+        ),
+        ("[0, 1]", "[0, -1]", r"toml: configuration plain: .*seed is -1, expected 0 or more"),
         ("set =", 'file = "none.toml"\nset =', "none.toml: No such file"),
         ("set =", "sets =", "configurations.lossy.sets is unknown, expected perhaps set"),
         ("seeds", "seed", "seed is unknown, expected perhaps seeds"),
