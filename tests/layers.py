@@ -228,7 +228,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "the command",
             "base config kernels recording runs converters exchange fusion evaluation",
             "report viewing checks camera_calibration recalibration team_posegraph bench experiments",
-            "batch cache comparison doctor steps run_plan existing_run runner replay",
+            "batch cache comparison doctor steps run_plan existing_run runner replay time_left",
         ),
     ),
 )

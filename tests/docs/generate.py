@@ -119,6 +119,7 @@ def config_page() -> str:
         "`duagc config show` prints them as TOML with their documentation, `duagc config check FILE` checks a file.\n"
         "Set one with `--set frontend.mapping.max_gaussians=60000`, or several with `--config FILE`; "
         "unknown names are errors.\n"
+        "Numbers are 0 or more where nothing else stands.\n"
         "A run stores the configuration that it used as `config.toml` in its folder.\n"
     )
     parts += list(_sections(RunConfig(), ""))
