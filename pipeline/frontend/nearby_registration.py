@@ -24,7 +24,7 @@ from duagc.pipeline.frontend.prediction import Prediction
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration import Registration, RegistrationConfig, register
+from duagc.pipeline.registration import Outcome, Registration, RegistrationConfig, register
 
 REACH_SIGMAS = 3.0
 """Standard deviations of a prediction within which a view is taken to be."""
@@ -80,7 +80,7 @@ def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCand
     for candidate in _from_features(state, frame, state.config.tracking, only=only):
         other = verify(FOUND_NEARBY, state, frame, candidate)
         if isinstance(other, PoseCandidate) and (
-            (not usual and _looks_as_usual(state, other)) or _fits_better(state, other, found)
+            (not usual and _looks_as_usual(state, other)) or fits_better(state, other, found)
         ):
             return other
     return found
@@ -108,8 +108,14 @@ def _may_be_beyond_reach(state: TrackingState, predicted: Prediction) -> bool:
     return REACH_SIGMAS * predicted.sigma_px > state.config.tracking.prior.max_deviation_px
 
 
-def _fits_better(state: TrackingState, candidate: PoseCandidate, found: PoseCandidate) -> bool:
-    """Whether another minimum of the same registration is the deeper one, by both residuals of unknown scales."""
+def fits_better(state: TrackingState, candidate: PoseCandidate, found: PoseCandidate) -> bool:
+    """Whether another minimum of the same registration is the deeper one, by both residuals of unknown scales.
+
+    Args:
+        state: what the tracker knows.
+        candidate: the other minimum.
+        found: the one that was found.
+    """
     other, result, tracking = candidate.result, found.result, state.config.tracking
     if candidate.keyframe_index != found.keyframe_index or candidate.without is not found.without:
         return False
@@ -143,7 +149,7 @@ def _or_from_coarser(
     )
     result = register_predicted(state, frame, predicted, coarser)
     other = PoseCandidate(found.keyframe_index, result)
-    if result.ok and (not found.result.ok or _fits_better(state, other, found)):
+    if result.ok and (not found.result.ok or fits_better(state, other, found)):
         return other
     return found
 
@@ -160,7 +166,7 @@ def _attempts(
 
     From the prediction, from the motion that features agree on, then with wider gates. Where the prediction is
     weak, features come first and may outweigh what looks unlike, and color alone, which starts from it, is no
-    check. Where it is not, what looks unlike is another place.
+    check. Where it is not, what looks unlike is another place; of a keyframe little may be seen all the same.
     """
     tracking, index = state.config.tracking, state.keyframe_index
     last, predicted = state.T_keyframe_camera, state.predict(frame.stamp_ns)
@@ -171,9 +177,11 @@ def _attempts(
     if weak:
         for candidate in _from_features(state, frame, tracking.verified_by_features()):
             yield candidate, FOUND_BY_FEATURES
+    little = False
     if not state.lost:
         for start in starts:
             candidate = PoseCandidate(index, register_predicted(state, frame, start, tracking.registration))
+            little |= candidate.result.outcome is Outcome.LOW_OVERLAP
             if start is predicted and not weak:
                 candidate = _or_from_coarser(state, frame, predicted, candidate)
             yield candidate, PLAUSIBLE if weak else FOLLOWED
@@ -187,6 +195,23 @@ def _attempts(
         yield PoseCandidate(index, result), PLAUSIBLE if weak else FOUND_NEARBY
     if weak and (agreed := _from_all_around(state, frame, predicted)) is not None:
         yield agreed, FOUND_FROM_ALL_AROUND
+    if little and not weak:
+        for candidate in _sharing_little(state, frame, predicted):
+            yield candidate, FOUND_BY_FEATURES
+
+
+def _sharing_little(
+    state: TrackingState, frame: CurrentFrame, predicted: Prediction
+) -> Iterator[PoseCandidate]:
+    """Registrations that features verify, and that need less overlap for it.
+
+    Every frame moves on by much where baselines are wide, and a held-out one leaves no keyframe: the next then shares
+    what two steps leave of the view, less where depth has holes.
+    """
+    tracking = state.config.tracking.verified_by_features()
+    result = register_predicted(state, frame, predicted, tracking.registration)
+    yield PoseCandidate(state.keyframe_index, result)
+    yield from _from_features(state, frame, tracking)
 
 
 def _from_all_around(

@@ -144,7 +144,7 @@ def test_of_two_minima_the_one_that_fewer_samples_fit_is_the_worse(run: Undistur
     slid = replace(found.result, T_reference_target=T, rms_gray=0.8 * found.result.rms_gray)
     for overlap, better in ((0.9, True), (0.5, False)):
         other = replace(found, result=replace(slid, overlap=overlap * found.result.overlap))
-        assert nearby_registration._fits_better(state, other, found) == better
+        assert nearby_registration.fits_better(state, other, found) == better
 
 
 @pytest.mark.parametrize(("steps_m", "speed_m_s"), [([0.3] * 8, 18.0), ([0.3, -0.3] * 4, 3.0)])
@@ -213,6 +213,21 @@ def test_a_camera_with_a_weak_prediction_and_few_features_is_followed_from_all_a
     assert distance_m(run, state, nearby_registration.register_nearby(state, frame), start) < 2e-3
     monkeypatch.setattr(nearby_registration, "_from_all_around", lambda *_: None)
     assert nearby_registration.register_nearby(state, frame) is Reason.OBSTRUCTED
+
+
+def test_features_verify_a_frame_that_shares_little_with_its_keyframe(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a held-out frame, where every frame moves on by a third of the view."""
+    state, frame = prepared(run)
+    assert not state.weakly_predicted(state.predict(frame.stamp_ns))
+    more, usual = {"min_overlap": 0.999}, state.config.tracking
+    settings = {name: getattr(usual, name).model_copy(update=more) for name in ("registration", "recovery")}
+    tracking = usual.model_copy(update=settings)
+    state.config = state.config.model_copy(update={"tracking": tracking})
+    assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
+    monkeypatch.setattr(feature_checks, "features_agree", lambda *_: False)
+    assert nearby_registration.register_nearby(state, frame) is Reason.LOW_OVERLAP
 
 
 class ByColor:
