@@ -13,7 +13,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels, hidden_pixels
-from duagc.pipeline.frontend.nearby_registration import register_nearby, went_far
+from duagc.pipeline.frontend.nearby_registration import fits_better, register_nearby, went_far
 from duagc.pipeline.frontend.pose_checks import FOLLOWED, verify
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
@@ -71,9 +71,13 @@ def _checked(
     most = state.config.tracking.failure.max_free_space_violations
     if hidden.share <= LITTLE * most:
         return replace(frame, suspected=hidden), whole
-    if hidden.share <= most and not went_far(state, frame, whole) and _stays(state, frame, whole, hidden):
+    there = _registered_there(state, frame, whole, hidden)
+    little = there is not None and max(hidden.share, _hides(there[0])) <= most
+    if little and not went_far(state, frame, whole):
         return replace(frame, suspected=hidden), whole
     without = _register_without(state, frame, T_map_camera)
+    if there is not None and without is not None and fits_better(state, there[1], without[1]):
+        without = there  # from the prediction it ended in a wrong minimum
     usual = without is not None and _usual(state, without[1])
     if without is not None and usual and (_hides(without[0]) > most or _apart(state, whole, without[1])):
         state.occlusion.active = True
@@ -82,16 +86,19 @@ def _checked(
     return replace(frame, suspected=hidden), found
 
 
-def _stays(state: TrackingState, frame: CurrentFrame, whole: PoseCandidate, hidden: HiddenPixels) -> bool:
-    """Whether a frame is where it was found as a whole without what may hide it, too, and no more of it is hidden."""
-    reference = state.keyframes[whole.keyframe_index].reference
-    tracking, T_found = state.config.tracking, whole.result.T_reference_target
-    result = register(reference, frame.without(hidden).pyramid, T_found, tracking.registration)
-    without = replace(whole, result=result)
-    if not result.ok or _apart(state, whole, without):
-        return False
-    still = _hidden(state, frame, state.in_map(without))
-    return still.share <= tracking.failure.max_free_space_violations
+def _registered_there(
+    state: TrackingState, frame: CurrentFrame, whole: PoseCandidate, hidden: HiddenPixels
+) -> tuple[CurrentFrame, PoseCandidate] | None:
+    """A frame without what may hide it, from where it was found as a whole; None: it does not stay there."""
+    reference, registration = (
+        state.keyframes[whole.keyframe_index].reference,
+        state.config.tracking.registration,
+    )
+    result = register(reference, frame.without(hidden).pyramid, whole.result.T_reference_target, registration)
+    there = replace(whole, result=result)
+    if not result.ok or _apart(state, whole, there):
+        return None
+    return frame.without(_hidden(state, frame, state.in_map(there))), there
 
 
 def _hides(frame: CurrentFrame) -> float:

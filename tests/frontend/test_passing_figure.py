@@ -15,6 +15,7 @@ from duagc.pipeline.experiments.disturbed_tracking import WRONG_M, Undisturbed
 from duagc.pipeline.experiments.shots import Shot
 from duagc.pipeline.frontend import occluded_frames
 from duagc.pipeline.frontend.current_frame import CurrentFrame
+from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels, carried, hidden_pixels
 from duagc.pipeline.frontend.occluded_frames import LITTLE, register_visible
@@ -156,3 +157,28 @@ def test_a_frame_is_registered_without_an_object_only_where_that_may_change_it(
     assert bool(asked) == again
     assert found.suspected is not None
     assert found.suspected.share == share
+
+
+@pytest.mark.parametrize(("gray", "off_m"), [(2.0, 0.0), (0.5, 0.1)])
+def test_of_two_places_without_an_object_the_one_that_fits_better_counts(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch, gray: float, off_m: float
+) -> None:
+    """From a prediction that is far off, a registration ends in a wrong minimum; features had led to the right one."""
+    start = STARTS[0]
+    tracker, shot = run.tracker(start), run.shots[start]
+    image = shot.color.astype(np.float32) / 255
+    frame = tracker.prepared(
+        RgbdImages(frame_index=shot.index, stamp_ns=shot.stamp_ns, image=image, depth_m=shot.depth)
+    )
+    right = occluded_frames._register_without(tracker.state, frame, run.poses[start])
+    assert right is not None
+    T = right[1].result.T_reference_target @ se3.exp(np.array([off_m or 0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    result = replace(right[1].result, T_reference_target=T, rms_gray=gray * right[1].result.rms_gray)
+    wrong = frame.without(thing(0.2)), replace(right[1], result=result)
+    monkeypatch.setattr(occluded_frames, "_hidden", lambda *_: thing(0.2))
+    monkeypatch.setattr(occluded_frames, "_register_without", lambda *_: wrong)
+    monkeypatch.setattr(occluded_frames, "_usual", lambda *_: True)
+    _, found = register_visible(tracker.state, frame)
+    assert not isinstance(found, Reason)
+    distance_m = se3.distance(tracker.state.in_map(found), run.poses[start])[0]
+    assert distance_m == pytest.approx(off_m, abs=5e-3)
