@@ -71,13 +71,16 @@ def _checked(
     most = state.config.tracking.failure.max_free_space_violations
     if hidden.share <= LITTLE * most:
         return replace(frame, suspected=hidden), whole
-    there = _registered_there(state, frame, whole, hidden)
-    little = there is not None and max(hidden.share, _hides(there[0])) <= most
-    if little and not went_far(state, frame, whole):
-        return replace(frame, suspected=hidden), whole
+    there = None
+    if hidden.share <= most and not went_far(state, frame, whole):
+        there = _registered_there(state, frame, whole, hidden)
+        if there is not None and _hides(there[0]) <= most:
+            return replace(frame, suspected=hidden), whole
     without = _register_without(state, frame, T_map_camera)
-    if there is not None and without is not None and fits_better(state, there[1], without[1]):
-        without = there  # from the prediction it ended in a wrong minimum
+    if without is not None and _apart(state, whole, without[1]):
+        there = there or _registered_there(state, frame, whole, hidden)
+        if there is not None and fits_better(state, there[1], without[1]):
+            without = there  # from the prediction it ended in a wrong minimum
     usual = without is not None and _usual(state, without[1])
     if without is not None and usual and (_hides(without[0]) > most or _apart(state, whole, without[1])):
         state.occlusion.active = True
@@ -90,11 +93,9 @@ def _registered_there(
     state: TrackingState, frame: CurrentFrame, whole: PoseCandidate, hidden: HiddenPixels
 ) -> tuple[CurrentFrame, PoseCandidate] | None:
     """A frame without what may hide it, from where it was found as a whole; None: it does not stay there."""
-    reference, registration = (
-        state.keyframes[whole.keyframe_index].reference,
-        state.config.tracking.registration,
-    )
-    result = register(reference, frame.without(hidden).pyramid, whole.result.T_reference_target, registration)
+    reference, clear = state.keyframes[whole.keyframe_index].reference, frame.without(hidden)
+    T_found = whole.result.T_reference_target
+    result = register(reference, clear.pyramid, T_found, state.config.tracking.registration)
     there = replace(whole, result=result)
     if not result.ok or _apart(state, whole, there):
         return None
