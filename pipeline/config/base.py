@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic_core import ErrorDetails
 
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_toml
@@ -121,15 +120,15 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
         raise DuagError(f"{source}: {name} {value} {expected_of(first)}") from error
 
 
-def expected_of(complaint: ErrorDetails) -> str:
+def expected_of(complaint: Mapping[str, object]) -> str:
     """What pydantic expected in place of a wrong value, in the words of every other message.
 
     Args:
         complaint: one of `ValidationError.errors()`.
     """
-    message = complaint["msg"].replace("Input should be", "expected", 1)
+    message = str(complaint["msg"]).replace("Input should be", "expected", 1)
     message = re.sub("^expected (greater|less) than", r"expected a number \1 than", message)
-    return EXPECTED.get(complaint["type"], message)
+    return EXPECTED.get(str(complaint["type"]), message)
 
 
 def _said_where(name: str, source: str, overrides: Sequence[str]) -> str:
