@@ -67,10 +67,12 @@ def hidden_pixels(
     kept = (v % step == 0) & (u % step == 0)
     v, u, points_map = v[kept] // step, u[kept] // step, se3.transform(T_map_camera, view.points[kept])
     seen, least = tuple(seen), config.moving.min_region * inverse_depth.size
+    T_views_map = se3.inverse(np.reshape([T_map_view for _, T_map_view in seen], (-1, 4, 4)))
+    views = [(level, T_view_map) for (level, _), T_view_map in zip(seen, T_views_map, strict=True)]
     some = (v % 2 == 0) & (u % 2 == 0)
-    votes = _votes(points_map[some], seen, config)
+    votes = _votes(points_map[some], views, config)
     if np.count_nonzero(votes.is_free) >= least / 8:  # half as many as of a region that is large enough
-        votes = _votes(points_map, seen, config)
+        votes = _votes(points_map, views, config)
     if np.count_nonzero(votes.is_free) < least:
         return HiddenPixels(np.zeros(view.inverse_depth.shape, bool), 0.0, votes.visible)
     is_free, is_surface = np.zeros(inverse_depth.shape, bool), np.zeros(inverse_depth.shape, bool)
@@ -104,14 +106,14 @@ class _Votes:
     visible: float
 
 
-def _votes(points_map: Array, seen: Sequence[tuple[Level, Array]], config: FrontendConfig) -> _Votes:
-    """What earlier views, as `hidden_pixels` takes them, say of points [n, 3] in the map, meters."""
+def _votes(points_map: Array, views: Sequence[tuple[Level, Array]], config: FrontendConfig) -> _Votes:
+    """What earlier views, each with T_view_map [4, 4], say of points [n, 3] in the map, meters."""
     n = len(points_map)
     free, there, judged = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, bool)
-    for level, T_map_view in seen:
+    for level, T_view_map in views:
         where = free_space(
             points_map,
-            se3.inverse(T_map_view),
+            T_view_map,
             level.nearest,
             level.camera,
             gate_m=config.tracking.registration.depth_gate_m,
