@@ -8,15 +8,10 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.judgment import contradicts
-from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.feature_judgment import judge_motion
 from duagc.pipeline.registration.feature_motion import features_agree, follows_something_moved
-
-FASTER = 2.0
-"""Times the speed with which a camera was last followed, by which it may be faster afterwards."""
 
 
 class FeaturesConfirm:
@@ -150,21 +145,3 @@ def from_prediction(
 def _draws(stream: str, frame: CurrentFrame, candidate: PoseCandidate) -> np.random.Generator:
     """Draws that only choose which samples are tried: the same in every run."""
     return random_streams.generator(0, stream, frame=frame.frame_index, keyframe=candidate.keyframe_index)
-
-
-def farthest_m(
-    state: TrackingState, elapsed_s: float, keyframe: TrackedKeyframe, *, slack_m: float = 0.0
-) -> float:
-    """How far the camera can have come in a time, meters.
-
-    Vehicles are faster than what is carried by hand: a camera may be twice as fast as its last frames came forward,
-    which one that is shaken does not.
-
-    Args:
-        state: what the tracker knows.
-        elapsed_s: the time.
-        keyframe: what it sees.
-        slack_m: added to the distance.
-    """
-    speed_m_s = max(state.config.tracking.failure.max_speed_m_s, FASTER * state.followed_m_s)
-    return (speed_m_s * max(elapsed_s, 0.0) + slack_m) * reach_factor(keyframe.median_depth_m)

@@ -20,14 +20,13 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.current_frame import features_of
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
-from duagc.pipeline.frontend.feature_checks import FASTER
 from duagc.pipeline.frontend.judgment import contradicts
+from duagc.pipeline.frontend.reach import farthest_m, fastest_m_s
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.submaps import lost
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe, tracked_path
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Registration, RgbdPyramid
-from duagc.pipeline.registration.align import reach_factor
 from duagc.pipeline.registration.feature_judgment import judge_motion
 from duagc.pipeline.registration.feature_motion import (
     features_agree,
@@ -261,7 +260,7 @@ class _Reach:
         moved_m = np.linalg.norm(np.diff(path.poses[:, :3, 3], axis=0), axis=1)
         elapsed_s = 1e-9 * np.diff(path.stamps_ns)
         usual_m_s = float(np.median(moved_m / np.maximum(elapsed_s, 1e-9))) if len(moved_m) else 0.0
-        return _Reach(T_map_keyframes, max(limits.max_speed_m_s, FASTER * usual_m_s), limits.slack_m)
+        return _Reach(T_map_keyframes, fastest_m_s(usual_m_s, limits), limits.slack_m)
 
     def holds(self, frame: TrackedFrame, T_map_camera: Array, other: TrackedFrame, seen_m: float) -> bool:
         """Whether a camera can have been at two places at the times of two frames.
@@ -275,4 +274,4 @@ class _Reach:
         T_map_other = self.T_map_keyframes[other.keyframe_index] @ other.T_keyframe_camera
         elapsed_s = abs(frame.stamp_ns - other.stamp_ns) * 1e-9
         moved_m = float(se3.distance(T_map_camera, T_map_other)[0])
-        return moved_m <= (self.speed_m_s * elapsed_s + self.slack_m) * reach_factor(seen_m)
+        return moved_m <= farthest_m(self.speed_m_s, elapsed_s, seen_m, slack_m=self.slack_m)

@@ -20,9 +20,9 @@ from duagc.pipeline.frontend.feature_checks import (
     FeaturesAllowWorseLook,
     FeaturesConfirm,
     FeaturesDoNotContradict,
-    farthest_m,
     from_prediction,
 )
+from duagc.pipeline.frontend.reach import farthest_m, fastest_m_s
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
@@ -246,7 +246,8 @@ class WithinReach:
         """
         limits, keyframe = state.config.tracking.failure, state.keyframes[candidate.keyframe_index]
         moved_m, _ = from_prediction(state, frame, candidate)
-        reach_m = farthest_m(state, state.elapsed_s(frame.stamp_ns), keyframe, slack_m=limits.slack_m)
+        speed_m_s, elapsed_s = fastest_m_s(state.followed_m_s, limits), state.elapsed_s(frame.stamp_ns)
+        reach_m = farthest_m(speed_m_s, elapsed_s, keyframe.median_depth_m, slack_m=limits.slack_m)
         if moved_m <= reach_m or self._shows_its_speed(state, frame, candidate):
             return candidate
         return Reason.OBSTRUCTED

@@ -13,11 +13,11 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.feature_checks import farthest_m
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.matching_keyframes import most_matching
 from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.pose_checks import FOUND_AGAIN, DoesNotFollowMovedThings, verify
+from duagc.pipeline.frontend.reach import farthest_m, fastest_m_s
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
@@ -137,7 +137,8 @@ class Relocalizer:
         index, last = before.candidate.keyframe_index, before.candidate.result.T_reference_target
         tracking = state.config.tracking
         elapsed_s = (frame.stamp_ns - before.stamp_ns) * 1e-9
-        reach_m = farthest_m(state, elapsed_s, state.keyframes[index])
+        speed_m_s = fastest_m_s(state.followed_m_s, tracking.failure)
+        reach_m = farthest_m(speed_m_s, elapsed_s, state.keyframes[index].median_depth_m)
         candidate = None
         for start in _starts(state, frame, index, last):
             result = register_until_stable(

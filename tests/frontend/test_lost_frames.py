@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
-from duagc.pipeline.frontend import lost_frames
+from duagc.pipeline.frontend import reach
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.lost_frames import found_afterwards, without_jumps
 from duagc.pipeline.frontend.submaps import lost
@@ -65,7 +65,7 @@ def test_a_lost_frame_of_a_vehicle_is_found_between_its_neighbors(
         for f in with_loss(run, LOST, Reason.UNCONFIRMED)[LOST % 12 :: 12]
     ]
     assert looked_for(run, frames, {})[LOST // 12].status is Status.RELOCALIZED
-    monkeypatch.setattr(lost_frames, "FASTER", 0.0)
+    monkeypatch.setattr(reach, "FASTER", 0.0)
     assert looked_for(run, frames, {}) == frames, "of what is carried by hand"
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from duagc.pipeline import registration
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
-from duagc.pipeline.frontend import feature_checks, nearby_registration
+from duagc.pipeline.frontend import feature_checks, nearby_registration, reach
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
@@ -16,6 +16,7 @@ from duagc.pipeline.frontend.pose_checks import DepthColorConsistency
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Outcome
+from duagc.pipeline.registration.align import reach_factor
 from tests.frontend.conftest import START_OF_COMPARISONS as START
 from tests.frontend.conftest import STARTS
 
@@ -156,8 +157,11 @@ def test_what_is_driven_may_be_faster_and_what_is_shaken_not(
         state.stamp_ns += 33_333_333
         state.T_keyframe_camera = state.T_keyframe_camera @ se3.exp(np.array([step_m, 0, 0, 0, 0, 0]))
         state.remember_pose()
-    reach = feature_checks.reach_factor(state.keyframe.median_depth_m)
-    assert feature_checks.farthest_m(state, 1.0, state.keyframe) == pytest.approx(speed_m_s * reach, rel=0.02)
+    fastest_m_s = reach.fastest_m_s(state.followed_m_s, state.config.tracking.failure)
+    assert fastest_m_s == pytest.approx(speed_m_s, rel=0.02)
+    depth_m = state.keyframe.median_depth_m
+    in_a_second_m = speed_m_s * reach_factor(depth_m)
+    assert reach.farthest_m(fastest_m_s, 1.0, depth_m) == pytest.approx(in_a_second_m, rel=0.02)
 
 
 def test_features_are_not_asked_of_a_frame_that_looks_as_usual(
