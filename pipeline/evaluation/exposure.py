@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.evaluation.image_metrics import decibels
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
+from duagc.pipeline.kernels.squared_error import squared_error
+from duagc.pipeline.kernels.squared_error_definition import ExposedRender
 from duagc.pipeline.splat.losses import Rendered
 
 Array = NDArray[np.float64]
@@ -85,12 +86,7 @@ def fit_exposure(drawn: Array, image: Array) -> tuple[float, float] | Absent:
 
 
 def fitted_psnr(
-    render: Rendered,
-    image: Array,
-    valid: NDArray[np.bool_] | None = None,
-    *,
-    color: Image | None = None,
-    seen: Image | None = None,
+    render: Rendered, image: Image, valid: NDArray[np.bool_] | None = None
 ) -> FittedPsnr | Absent:
     """PSNR of each half of a view in the exposure that was fitted on the other half.
 
@@ -100,68 +96,44 @@ def fitted_psnr(
         render: of the map, on black.
         image: colors [h, w, 3] in 0..1.
         valid: bool [h, w], pixels that are fitted and scored; None: all.
-        color: `planes` of the render, where more is done with them; None: made here.
-        seen: `planes` of the image, where several renders are compared with it; None: made here.
 
     Returns:
         The scores, or why there are none.
     """
     height, width = image.shape[:2]
-    counted = np.ones((height, width), dtype=bool) if valid is None else valid
-    covered = counted & (render.alpha >= MIN_ALPHA)
-    whole = bool(counted.all())
+    covered = render.alpha >= MIN_ALPHA if valid is None else valid & (render.alpha >= MIN_ALPHA)
     halves = (slice(0, width // 2), slice(width // 2, width))
-    color = planes(render.color) if color is None else color
-    seen = planes(image) if seen is None else seen
     sums, counts = [], []
     for scored, other in (halves, halves[::-1]):
-        squares = _squared_errors((color, render.alpha, seen), scored, other, covered=covered)
-        if isinstance(squares, Absent):
-            return squares
-        pixels = counted[:, scored]
-        sums.append(float(np.sum(squares, dtype=np.float64)) if whole else masks.total(squares, pixels))
-        counts.append(len(squares) * int(np.count_nonzero(pixels)))
+        found = _fitted_on(render, image, other, covered=covered)
+        if isinstance(found, Absent):
+            return found
+        sums.append(squared_error(found, image, valid, scored))
+        pixels = (
+            height * (scored.stop - scored.start) if valid is None else np.count_nonzero(valid[:, scored])
+        )
+        counts.append(image.shape[2] * int(pixels))
     if not all(counts):
         return Absent("half of the image has no valid pixel")
     left, right = (decibels(total / count) for total, count in zip(sums, counts, strict=True))
     return FittedPsnr(left, right, decibels(sum(sums) / sum(counts)))
 
 
-def _squared_errors(
-    images: tuple[Image, Image, Image], scored: slice, fitted: slice, *, covered: NDArray[np.bool_]
-) -> Image | Absent:
-    """Squared errors [3, h, w'] of the scored columns in the exposure of the fitted columns.
-
-    Args:
-        images: rendered colors [3, h, w] and opacity [h, w], and the colors of the image [3, h, w].
-        scored: columns.
-        fitted: columns.
-        covered: bool [h, w], pixels that may be fitted.
-    """
-    color, alpha, image = images
-    grid = _grid(covered[:, fitted].size)
-    used = covered[:, fitted][grid]
-    squares = np.empty_like(image[:, :, scored])
-    for drawn, seen, error in zip(color, image, squares, strict=True):
-        found = fit_exposure(*(plane[:, fitted][grid][used].astype(np.float64) for plane in (drawn, seen)))
+def _fitted_on(
+    render: Rendered, image: Image, columns: slice, *, covered: NDArray[np.bool_]
+) -> ExposedRender | Absent:
+    """The render in the exposure that is fitted on some columns, where they are covered."""
+    grid = _grid(covered[:, columns].size)
+    used = covered[:, columns][grid]
+    drawn, seen = (colors[:, columns][grid][used].astype(np.float64) for colors in (render.color, image))
+    exposure = []
+    for of_channel in zip(drawn.T, seen.T, strict=True):
+        found = fit_exposure(*(np.ascontiguousarray(values) for values in of_channel))
         if isinstance(found, Absent):
             return found
-        gain, offset = found
-        np.multiply(drawn[:, scored], np.float32(gain), out=error)
-        error += np.float32(offset) * alpha[:, scored]
-        np.clip(error, 0, 1, out=error)
-        error -= seen[:, scored]
-        error *= error
-    return squares
-
-
-def planes(colors: NDArray[np.floating]) -> Image:
-    """Colors [h, w, 3] as [3, h, w]: arithmetic on every third number is slow.
-
-    Args:
-        colors: of any floating type.
-    """
-    return np.ascontiguousarray(colors.transpose(2, 0, 1), dtype=np.float32)
+        exposure.append(found)
+    gain, offset = np.array(exposure, np.float32).T
+    return ExposedRender(render.color, render.alpha, gain, offset)
 
 
 def _grid(pixels: int) -> tuple[slice, slice]:

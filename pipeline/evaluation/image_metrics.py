@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import masks
+from duagc.pipeline.kernels.squared_error import squared_error
+from duagc.pipeline.kernels.squared_error_definition import ExposedRender
+from duagc.pipeline.kernels.window_terms import window_means, window_terms
+from duagc.pipeline.kernels.window_terms_definition import WINDOW_RADIUS, SeenWindows
 from duagc.pipeline.splat.losses import Rendered, halve
 
 Image = NDArray[np.float32]
+NEITHER = np.ones(3, np.float32), np.zeros(3, np.float32)
+"""Gain and offset of a render in the exposure that it was drawn in."""
 
 
 def psnr(rendered: NDArray, reference: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
@@ -23,25 +29,21 @@ def psnr(rendered: NDArray, reference: NDArray, mask: NDArray[np.bool_] | None =
         reference: colors [H, W, 3] in 0..1.
         mask: bool [H, W], pixels that count; None: all.
     """
-    drawn, seen = (np.moveaxis(np.asarray(colors), -1, 0) for colors in (rendered, reference))
-    return psnr_of_planes(drawn, seen, mask)
+    color = np.asarray(rendered, np.float32)
+    as_drawn = ExposedRender(color, np.zeros(color.shape[:2], np.float32), *NEITHER)
+    return psnr_in_exposure(as_drawn, np.asarray(reference, np.float32), mask)
 
 
-def psnr_of_planes(
-    rendered: NDArray[np.floating], reference: NDArray[np.floating], mask: NDArray[np.bool_] | None = None
-) -> float:
-    """The function `psnr` of colors by channel, which is faster.
+def psnr_in_exposure(render: ExposedRender, reference: Image, mask: NDArray[np.bool_] | None = None) -> float:
+    """The function `psnr` of a render in an exposure.
 
     Args:
-        rendered: colors [3, H, W], clipped to 0..1 first.
-        reference: colors [3, H, W] in 0..1.
+        render: drawn, in its exposure.
+        reference: colors [H, W, 3] in 0..1.
         mask: bool [H, W], pixels that count; None: all.
     """
-    error = np.clip(rendered, 0, 1) - reference
-    squares = np.square(error, out=error)
-    if mask is None or mask.all():
-        return decibels(float(np.mean(squares, dtype=np.float64)))
-    return decibels(masks.total(squares, mask) / (len(squares) * np.count_nonzero(mask)))
+    values = reference.size if mask is None else reference.shape[2] * np.count_nonzero(mask)
+    return decibels(squared_error(render, reference, mask) / values)
 
 
 def decibels(mse: float) -> float:
@@ -53,27 +55,7 @@ def decibels(mse: float) -> float:
     return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))
 
 
-_WINDOW_RADIUS = 5
-_WINDOW_SIGMA = 1.5
-_C1, _C2 = 0.01**2, 0.03**2
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-
-
-@cache
-def _window() -> Image:
-    """Weights of a row of the window."""
-    import cv2
-
-    return np.asarray(cv2.getGaussianKernel(2 * _WINDOW_RADIUS + 1, _WINDOW_SIGMA, cv2.CV_32F))
-
-
-def _window_mean(image: Image) -> Image:
-    """11x11 Gaussian-weighted mean (sigma 1.5), only where the window lies inside the image."""
-    import cv2
-
-    smooth = cv2.sepFilter2D(image, cv2.CV_32F, _window(), _window())
-    inside = slice(_WINDOW_RADIUS, -_WINDOW_RADIUS)
-    return np.asarray(smooth[inside, inside])
 
 
 def counted_windows(mask: masks.Mask) -> masks.Mask:
@@ -82,92 +64,46 @@ def counted_windows(mask: masks.Mask) -> masks.Mask:
     Args:
         mask: bool [H, W], pixels that count.
     """
-    inside = slice(_WINDOW_RADIUS, -_WINDOW_RADIUS)
-    return masks.whole_windows(mask, _WINDOW_RADIUS)[inside, inside]
-
-
-_STRIP_ROWS = 32  # of windows at a time: what is computed of them stays in the cache
+    inside = slice(WINDOW_RADIUS, -WINDOW_RADIUS)
+    return masks.whole_windows(mask, WINDOW_RADIUS)[inside, inside]
 
 
 @dataclass(frozen=True)
 class _Scale:
-    """One scale of an image that renders are compared with, and what SSIM needs of it, [H, W, C].
+    """One scale of an image that renders are compared with, and what SSIM needs of it.
 
-    `y`: colors. `twice`: 2 y. `mean`, `mean2`, `variance`: 2 means, squares of means and variances of windows.
-    `weight`: 1 at window positions that count, else 0; None: all count.
+    `windows`: their weight is 1 at positions that count, else 0; None: all count. `mask`: pixels that count.
     """
 
-    y: Image
-    twice: Image
-    mean: Image
-    mean2: Image
-    variance: Image
+    windows: SeenWindows
     mask: masks.Mask | None
-    weight: Image | None
 
     @staticmethod
-    def of(y: Image, mask: masks.Mask | None) -> _Scale:
-        if min(y.shape[:2]) < 2 * _WINDOW_RADIUS + 1:
-            raise ValueError(
-                f"an image of {y.shape[1]}x{y.shape[0]} is smaller than the 11x11 window of SSIM"
-            )
-        mean = _window_mean(y)
-        mean2 = mean * mean
-        variance = _window_mean(y * y) - mean2
+    def of(image: Image, mask: masks.Mask | None) -> _Scale:
+        mean = window_means(image)
+        variance = window_means(image * image) - mean * mean
         weight = None
         if mask is not None and not (counted := counted_windows(mask)).all():
             weight = np.where(counted[..., None], np.ones_like(mean), np.float32(0))
-        return _Scale(y, twice=2 * y, mean=2 * mean, mean2=mean2, variance=variance, mask=mask, weight=weight)
+        return _Scale(SeenWindows(image, mean, variance, weight), mask)
 
     @cached_property
     def count(self) -> int:
         """Windows that count, in all channels."""
-        return self.mean.size if self.weight is None else int(np.count_nonzero(self.weight))
+        weight = self.windows.weight
+        return self.windows.mean.size if weight is None else int(np.count_nonzero(weight))
 
     def halved(self) -> _Scale:
         """The next scale."""
-        return _Scale.of(halve(self.y), None if self.mask is None else masks.halved(self.mask))
+        mask = None if self.mask is None else masks.halved(self.mask)
+        return _Scale.of(halve(self.windows.image), mask)
 
-    def terms(self, x: Image, *, whole: bool = True) -> tuple[float, float]:
-        """Mean SSIM and contrast-structure term of a render [H, W, C] in 0..1; without `whole` the latter twice."""
-        images = [np.empty_like(self.mean) for _ in range(1 + whole)]
-        for top in range(0, len(self.mean), _STRIP_ROWS):
-            rows = slice(top, top + _STRIP_ROWS)
-            seen = slice(top, top + _STRIP_ROWS + 2 * _WINDOW_RADIUS)
-            self._strip(x[seen], self.twice[seen], rows, images)
-        means = [self._mean(image) for image in images]
-        return means[-1], means[0]
-
-    def _mean(self, image: Image) -> float:
-        """Mean of what windows say, over those that count."""
-        if self.weight is None:
-            return float(np.mean(image, dtype=np.float64))
+    def terms(self, drawn: Image) -> tuple[float, float]:
+        """Mean contrast-structure term and SSIM of a render [H, W, C] in 0..1, over the windows that count."""
         if not self.count:
             raise ValueError("no 11x11 window of SSIM has usable pixels only")
-        return float(np.sum(image * self.weight, dtype=np.float64)) / self.count
-
-    def _strip(self, x: Image, twice: Image, rows: slice, images: Sequence[Image]) -> None:
-        """Contrast-structure term of some rows of windows, from the pixels that they see, and SSIM if it has an image.
-
-        (2 cov + C2) / (vx + vy + C2), and this times (2 mx my + C1) / (mx^2 + my^2 + C1).
-        """
-        mx = _window_mean(x)
-        mx2, mxy = mx * mx, mx * self.mean[rows]
-        below = _window_mean(x * x)
-        below -= mx2
-        below += self.variance[rows]
-        below += _C2
-        above = _window_mean(x * twice)
-        above -= mxy
-        above += _C2
-        structure = np.divide(above, below, out=images[0][rows])
-        if len(images) == 1:
-            return
-        mxy += _C1
-        mx2 += self.mean2[rows]
-        mx2 += _C1
-        mxy /= mx2
-        np.multiply(mxy, structure, out=images[1][rows])
+        structure, similarity = window_terms(drawn, self.windows)
+        return structure / self.count, similarity / self.count
 
 
 class SsimReference:
@@ -199,7 +135,7 @@ class SsimReference:
         Args:
             rendered: colors [H, W, 3], clipped to 0..1 first.
         """
-        return self._scale(0).terms(self._clipped(rendered))[0]
+        return self._scale(0).terms(self._clipped(rendered))[1]
 
     def both(self, rendered: NDArray, weights: Sequence[float] = MS_SSIM_WEIGHTS) -> tuple[float, float]:
         """SSIM and MS-SSIM of a render, as the functions of these names.
@@ -209,7 +145,7 @@ class SsimReference:
             weights: of the scales, fine to coarse.
         """
         x = self._clipped(rendered)
-        smallest = (2 * _WINDOW_RADIUS + 1) << (len(weights) - 1)
+        smallest = (2 * WINDOW_RADIUS + 1) << (len(weights) - 1)
         if min(x.shape[:2]) < smallest:
             raise ValueError(
                 f"MS-SSIM of {len(weights)} scales needs {smallest} pixels, found {x.shape[1]}x{x.shape[0]}"
@@ -217,7 +153,7 @@ class SsimReference:
         first, product = 0.0, 1.0
         last = len(weights) - 1
         for k, weight in enumerate(weights):
-            whole, structure = self._scale(k).terms(x, whole=k in (0, last))
+            structure, whole = self._scale(k).terms(x)
             first = first if k else whole
             product *= max(whole if k == last else structure, 0.0) ** weight
             x = halve(x) if k < last else x

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.evaluation import image_metrics
-from duagc.pipeline.evaluation.exposure import fitted_psnr, planes
+from duagc.pipeline.evaluation.exposure import fitted_psnr
 from duagc.pipeline.evaluation.image_metrics import SsimReference
 from duagc.pipeline.evaluation.results import Absent, mean
 from duagc.pipeline.geometry import masks, se3
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.geometry.masks import Mask
+from duagc.pipeline.kernels.squared_error_definition import ExposedRender
 from duagc.pipeline.splat.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -60,14 +61,14 @@ class ComparedImage:
     """An image that renders are compared with; what depends on it alone is computed once."""
 
     def __init__(self, color: NDArray[np.uint8], mask: Mask | None = None) -> None:
-        """Convert the colors to 0..1 and to planes, as comparisons need them.
+        """Convert the colors to 0..1.
 
         Args:
             color: [h, w, 3] RGB.
             mask: bool [h, w], pixels that may be used; None: all.
         """
-        self.color: NDArray[np.float64] = color.astype(np.float64) / 255.0
-        self.planes, self.mask = planes(self.color), mask
+        self.color: NDArray[np.float32] = (color.astype(np.float64) / 255.0).astype(np.float32)
+        self.mask = mask
         self.structure = SsimReference(self.color, mask)
 
 
@@ -115,16 +116,13 @@ def score_view(
         exact_m = exact_m if isinstance(exact_m, Absent) else np.where(mask, exact_m, np.float32(0))
     l1_m, completeness = _depth(render, depth_m, "recorded")
     ssim, ms_ssim = _structure(render, image.structure, min(image.color.shape[:2]))
-    colors = planes(render.color)
-    psnr_db = _psnr(colors, image)
-    fitted = _psnr_in_fitted_exposure(render, colors, image)
-    interpolated_db = psnr_db if exposure is None else _psnr_in(exposure, render, colors, image)
+    psnr_db = _psnr(render, image)
+    fitted = _psnr_in_fitted_exposure(render, image)
+    interpolated_db = psnr_db if exposure is None else _psnr(render, image, exposure)
     return ViewScore(
         psnr_db=psnr_db,
         psnr_interpolated_db=interpolated_db,
-        psnr_moved_db=interpolated_db
-        if moved is None
-        else _psnr_in(exposure, moved, planes(moved.color), image),
+        psnr_moved_db=interpolated_db if moved is None else _psnr(moved, image, exposure),
         psnr_exposure_db=fitted[0],
         psnr_exposure_left_db=fitted[1],
         psnr_exposure_right_db=fitted[2],
@@ -150,24 +148,18 @@ def in_exposure(render: Render, exposure: Exposure | None) -> Render:
     return replace(render, color=exposure.in_image(render.color, render.alpha))
 
 
-def _psnr(colors: NDArray[np.float32], image: ComparedImage) -> Score:
+def _psnr(render: Render, image: ComparedImage, exposure: Exposure | None = None) -> Score:
+    """PSNR of a render, in an exposure if one is given."""
     if image.mask is not None and not image.mask.any():
         return NO_PIXEL
-    return min(image_metrics.psnr_of_planes(colors, image.planes, image.mask), PSNR_CEILING_DB)
+    gain, offset = image_metrics.NEITHER if exposure is None else (exposure.gain, exposure.offset)
+    drawn = ExposedRender(render.color, render.alpha, gain.astype(np.float32), offset.astype(np.float32))
+    return min(image_metrics.psnr_in_exposure(drawn, image.color, image.mask), PSNR_CEILING_DB)
 
 
-def _psnr_in(
-    exposure: Exposure | None, render: Render, colors: NDArray[np.float32], image: ComparedImage
-) -> Score:
-    """PSNR of a render, whose colors by channel are given, in an exposure."""
-    return _psnr(colors if exposure is None else exposure.planes_in_image(colors, render.alpha), image)
-
-
-def _psnr_in_fitted_exposure(
-    render: Render, colors: NDArray[np.float32], image: ComparedImage
-) -> tuple[Score, Score, Score]:
-    """PSNR of the whole view, its left and its right half, each half in the exposure fitted on the other."""
-    found = fitted_psnr(render, image.color, image.mask, color=colors, seen=image.planes)
+def _psnr_in_fitted_exposure(render: Render, image: ComparedImage) -> tuple[Score, Score, Score]:
+    """PSNR of the whole view, its left and its right half, each half in the exposure fitted on the other half."""
+    found = fitted_psnr(render, image.color, image.mask)
     if isinstance(found, Absent):
         return found, found, found
     both, left, right = (min(value, PSNR_CEILING_DB) for value in (found.both, found.left, found.right))

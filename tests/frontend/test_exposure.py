@@ -276,7 +276,7 @@ def test_what_a_training_takes_of_an_image_is_the_image_in_the_colors_of_the_map
     assert np.array_equal(table[color, np.arange(3)], unit_color(color, exposure))
     assert np.array_equal(by_table(color, table), unit_color(color, exposure))
     if exposure is not None:
-        planes = np.ascontiguousarray(np.moveaxis(unit_color(color, exposure), -1, 0))
-        by_plane = exposure.planes_in_image(planes, alpha)
-        whole = exposure.in_image(unit_color(color, exposure), alpha)
-        assert np.array_equal(np.moveaxis(by_plane, 0, -1), whole)
+        shown = unit_color(color, exposure)
+        gain, offset = exposure.gain.astype(np.float32), exposure.offset.astype(np.float32)
+        in_image = gain * shown + offset * alpha[..., None]
+        assert np.array_equal(exposure.in_image(shown, alpha), in_image)

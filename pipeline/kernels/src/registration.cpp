@@ -4,6 +4,8 @@
 #include "image_pyramid.h"
 #include "moved_depth.h"
 #include "registration_search.h"
+#include "squared_error.h"
+#include "window_terms.h"
 
 namespace raster {
 extern const RegistrationKernels REGISTRATION_TABLE;
@@ -11,5 +13,6 @@ const RegistrationKernels REGISTRATION_TABLE = {KERNEL_ISA::align_at,      KERNE
                                                 KERNEL_ISA::gray_of_color, KERNEL_ISA::invert_depth, KERNEL_ISA::halve,
                                                 KERNEL_ISA::surface_normals, KERNEL_ISA::move_depth,   KERNEL_ISA::draw_triangles,
                                                 KERNEL_ISA::register_depth, KERNEL_ISA::displace_depth,
-                                                KERNEL_ISA::free_space};
+                                                KERNEL_ISA::free_space,   KERNEL_ISA::window_means, KERNEL_ISA::window_terms,
+                                                KERNEL_ISA::squared_error};
 }  // namespace raster

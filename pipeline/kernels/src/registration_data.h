@@ -135,6 +135,30 @@ struct JudgedPoints {
     const float* nearest;         // [h, w], 1/m, 0 = unknown
 };
 
+// An image whose 11x11 windows are looked at, each but at its border.
+struct ImageWindows {
+    size_t width, height, channels;
+    const float* image;    // [h, w, channels]
+    const float* weights;  // [6] of a row of the window, from its end to the middle
+};
+
+// A drawn image, and the one that it is compared with.
+struct ComparedWindows {
+    ImageWindows drawn;
+    const float* seen;      // as the drawn one
+    const float* mean;      // [h - 10, w - 10, channels], of its windows
+    const float* variance;  // of its windows
+    const float* weight;    // of what is said of them; may be null
+};
+
+// A drawn image in an exposure, and the image that it is compared with, in the columns from left to right.
+struct ExposedImage {
+    size_t width, height, left, right;
+    const float *drawn, *alpha, *seen;  // [h, w, 3], [h, w], [h, w, 3]
+    const uint8_t* mask;                // [h, w], 1 where pixels count, else 0; may be null
+    const float *gain, *offset;         // [3]
+};
+
 // Memory of one thread, kept between calls.
 struct AlignmentScratch {
     Scratch<float> floats;
@@ -167,6 +191,11 @@ struct RegistrationKernels {
     void (*displace_depth)(const DisplacedDepth&, double* inverse, double* x, double* depth);
     // [n]: one of PLACE_...
     void (*free_space)(const JudgedPoints&, int8_t* where);
+    // [h - 10, w - 10, channels].
+    void (*window_means)(const ImageWindows&, Scratch<float>&, float* means);
+    // [2]: sums of the contrast-structure terms and of SSIM.
+    void (*window_terms)(const ComparedWindows&, Scratch<float>&, double* sums);
+    double (*squared_error)(const ExposedImage&, Scratch<float>&);
 };
 
 }  // namespace raster

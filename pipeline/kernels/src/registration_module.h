@@ -184,6 +184,35 @@ static void free_space(const std::string& isa, const DoubleInputs& points, const
     kernels->free_space(of, where.data());
 }
 
+static ImageWindows windows_of(const Inputs& image, const Inputs& weights) {
+    return {image.shape(1), image.shape(0), image.shape(2), image.data(), weights.data()};
+}
+
+static void window_means(const std::string& isa, const Inputs& image, const Inputs& weights, const Floats& means) {
+    const RegistrationKernels* kernels = kernels_named(isa)->registration;
+    const nb::gil_scoped_release unlocked;
+    kernels->window_means(windows_of(image, weights), alignment_scratch().floats, means.data());
+}
+
+// weight: empty if all count alike.
+static void window_terms(const std::string& isa, const Inputs& drawn, const Inputs& seen, const Inputs& mean, const Inputs& variance,
+                         const Inputs& weight, const Inputs& weights, const Doubles& sums) {
+    const ComparedWindows of = {windows_of(drawn, weights), seen.data(), mean.data(), variance.data(), data_or_null(weight)};
+    const RegistrationKernels* kernels = kernels_named(isa)->registration;
+    const nb::gil_scoped_release unlocked;
+    kernels->window_terms(of, alignment_scratch().floats, sums.data());
+}
+
+// images: drawn, alpha, seen. mask: empty if all pixels count. exposure: gain and offset by channel.
+static double squared_error(const std::string& isa, const Inputs& drawn, const Inputs& alpha, const Inputs& seen, const Bytes& mask,
+                            const Inputs& exposure, int left, int right) {
+    const ExposedImage of = {drawn.shape(1), drawn.shape(0), static_cast<size_t>(left), static_cast<size_t>(right), drawn.data(), alpha.data(),
+                             seen.data(), data_or_null(mask), exposure.data(), exposure.data() + 3};
+    const RegistrationKernels* kernels = kernels_named(isa)->registration;
+    const nb::gil_scoped_release unlocked;
+    return kernels->squared_error(of, alignment_scratch().floats);
+}
+
 static void define_registration(nb::module_& m) {
     nb::class_<LevelArrays>(m, "LevelArrays")
         .def(nb::init<const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&, const Inputs&,
@@ -202,6 +231,9 @@ static void define_registration(nb::module_& m) {
     m.def("register_depth", register_depth);
     m.def("displace_depth", displace_depth);
     m.def("free_space", free_space);
+    m.def("window_means", window_means);
+    m.def("window_terms", window_terms);
+    m.def("squared_error", squared_error);
 }
 
 }  // namespace raster
