@@ -9,7 +9,6 @@ import numpy as np
 
 from duagc.converters.simulate.frames import FrameImages, FrameJob, FrameSettings, RenderPool
 from duagc.converters.simulate.movers import Mover, walk
-from duagc.converters.simulate.ply import write_points
 from duagc.converters.simulate.preview import Preview
 from duagc.converters.simulate.sensors import light, shutter
 from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
@@ -24,6 +23,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.atomic_folder import check_apart, resolved
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.ply_points import write_points
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry.camera import PinholeCamera
 

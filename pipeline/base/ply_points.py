@@ -1,4 +1,4 @@
-"""Points with normals in a binary .ply, as the geometry of a scene is written."""
+"""Points with normals in a binary .ply: the geometry of a scene, and point clouds for other programs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
 
 _TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4", "uint": "<u4"}
 
@@ -39,3 +40,41 @@ def read_points(path: Path) -> NDArray[np.void]:
     if len(body) != expected:
         raise DuagError(f"{path}: {len(body)} bytes of vertices, expected {expected}")
     return np.frombuffer(body, dtype=row)
+
+
+def write_points(
+    path: Path,
+    points: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    colors: NDArray[np.uint8],
+    **further: NDArray[np.floating],
+) -> None:
+    """Write a binary little-endian .ply whose only element is `vertex`; floating-point numbers in float32.
+
+    Args:
+        path: the file to write.
+        points: [n, 3], m.
+        normals: [n, 3], unit length, in the frame of the points.
+        colors: [n, 3], RGB.
+        further: [n] each, by the name of the property.
+
+    Raises:
+        DuagError: it cannot be written there.
+    """
+    properties = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    properties += [(name, "u1") for name in ("red", "green", "blue")]
+    properties += [(name, "<f4") for name in further]
+    rows = np.zeros(len(points), dtype=properties)
+    columns = [*points.T, *normals.T, *colors.T, *further.values()]
+    for (name, _), values in zip(properties, columns, strict=True):
+        rows[name] = values
+    words = {"<f4": "float", "u1": "uchar"}
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property {words[kind]} {name}" for name, kind in properties),
+        "end_header\n",
+    ]
+    with new_file(path) as part:
+        part.write_bytes("\n".join(header).encode() + rows.tobytes())

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
-from duagc.pipeline.base.open3d_import import import_open3d
+from duagc.pipeline.base.ply_points import write_points
 from duagc.pipeline.evaluation.pixel_deviation import stated_in_world
 from duagc.pipeline.geometry.view_extent import radii_m
 from duagc.pipeline.messages import GaussianMap
@@ -111,7 +111,7 @@ def _export_robot(run: RunFolder, robot: RobotRun, folder: Path, plan: ExportPla
     columns = _points(run, robot, shown) if plan.kind == "points" else {}
     rows = np.arange(len(gaussians))
     if plan.kind == "points":
-        rows = np.flatnonzero(columns["opacity"][:, 0] >= plan.min_opacity)
+        rows = np.flatnonzero(columns["opacity"] >= plan.min_opacity)
         if not len(rows):
             most = columns["opacity"].max(initial=0.0)
             raise DuagError(
@@ -131,7 +131,9 @@ def _export_robot(run: RunFolder, robot: RobotRun, folder: Path, plan: ExportPla
     for name, tile, chosen in parts:
         part = gaussians.select(chosen)
         if plan.kind == "points":
-            _write_points(folder / name, part, {key: values[chosen] for key, values in columns.items()})
+            colors = np.rint(np.clip(part.colors, 0.0, 1.0) * 255.0).astype(np.uint8)
+            of_part = {key: values[chosen] for key, values in columns.items()}
+            write_points(folder / name, part.means, colors=colors, **of_part)
         else:
             write_ply(folder / name, part)
         low, high = _drawn(part) if len(part) else (None, None)
@@ -153,11 +155,11 @@ def _points(run: RunFolder, robot: RobotRun, shown: GaussianMap) -> dict[str, ND
     cameras = [run.robots[name].trajectory.positions for name in robot.component if name in run.robots]
     opacity = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     sigma_m = stated_in_world(robot, shown).sigma_m
-    sigma_m = np.where(np.isfinite(sigma_m), sigma_m, np.nan)  # Open3D writes no infinite numbers
+    sigma_m = np.where(np.isfinite(sigma_m), sigma_m, np.nan)  # nothing is stated of these
     return {
         "normals": _toward(gaussians.normals(), gaussians.means, np.concatenate(cameras)).astype(np.float32),
-        "sigma_m": sigma_m.astype(np.float32)[:, None],
-        "opacity": opacity.astype(np.float32)[:, None],
+        "sigma_m": sigma_m.astype(np.float32),
+        "opacity": opacity.astype(np.float32),
     }
 
 
@@ -170,20 +172,3 @@ def _toward(
     _, nearest = KDTree(cameras).query(means)
     away = np.einsum("ij,ij->i", normals, cameras[nearest] - means) < 0
     return np.where(away[:, None], -normals, normals)
-
-
-def _write_points(path: Path, part: Gaussians, columns: dict[str, NDArray[np.float32]]) -> None:
-    o3d = import_open3d()
-    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(part.means))
-    colors = np.rint(np.clip(part.colors, 0.0, 1.0) * 255.0).astype(np.uint8)
-    cloud.point.colors = o3d.core.Tensor(colors)
-    for name, values in columns.items():
-        cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(values))
-    written = o3d.t.io.write_point_cloud(str(path), cloud)
-    back = o3d.t.io.read_point_cloud(str(path)).point if written else {}
-    if not written or any(
-        name not in back
-        or not np.array_equal(back[name].numpy(), cloud.point[name].numpy(), equal_nan=name == "sigma_m")
-        for name in ("positions", "colors", *columns)
-    ):
-        raise DuagError(f"{path}: could not be written; is the disk full?")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from duagc import schemas
-from duagc.converters.simulate.ply import write_points
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.ply_points import write_points
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation import rendering, views
 from duagc.pipeline.evaluation.groundtruth import Surface, surface

@@ -101,10 +101,14 @@ def test_a_gaussian_of_which_nothing_is_stated_has_no_deviation(fake, tmp_path, 
     np.testing.assert_array_equal(cloud.positions.numpy(), final_means(RunFolder(fake.run).robots["alpha"]))
 
 
-def test_points_that_find_no_room_are_told(fake, tmp_path):
-    plan = ExportPlan("points", min_opacity=0.0)
-    with no_file_larger_than(200), pytest.raises(DuagError, match="ply: could not be written"):
+@pytest.mark.parametrize("kind", ["points", "splats"])
+def test_a_map_that_finds_no_room_is_told(fake, tmp_path, capfd, kind):
+    plan = ExportPlan(kind, min_opacity=0.0)
+    capfd.readouterr()
+    with no_file_larger_than(200), pytest.raises(DuagError, match=r"alpha\.ply: File too large, expected"):
         export(fake.run, tmp_path / "out", plan)
+    said = [line for line in capfd.readouterr().err.splitlines() if "stay in memory" not in line]
+    assert said == []
     assert list(tmp_path.iterdir()) == []
 
 

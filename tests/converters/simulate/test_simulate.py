@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from duagc.converters.simulate.ply import write_points
 from duagc.converters.simulate.render import bake
 from duagc.converters.simulate.render.renderer import Renderer
 from duagc.converters.simulate.scenes.catalog import build
@@ -22,6 +21,7 @@ from duagc.converters.simulate.trajectories import loops
 from duagc.pipeline import messages
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.ply_points import write_points
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, content_digest, open_rgbd, read_log
