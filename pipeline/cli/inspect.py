@@ -67,6 +67,7 @@ def export(
     `duagc export outputs/demo/run --points --robot alpha --out outputs/cloud`,
     `duagc export outputs/house --tile 5 --out outputs/house_tiles`
     """
+    from duagc.pipeline.base.byte_counts import bytes_text
     from duagc.pipeline.viewing.map_export import ExportPlan
     from duagc.pipeline.viewing.map_export import export as export_maps
 
@@ -76,8 +77,8 @@ def export(
     if min_opacity is not None:
         plan = replace(plan, min_opacity=min_opacity)
     files = export_maps(run_folder, out, plan, force=force)
-    size_mb = sum(path.stat().st_size for path in files) / 1e6
-    say(f"{len(files)} file{'s' * (len(files) != 1)}, {size_mb:.1f} MB")
+    size = sum(path.stat().st_size for path in files)
+    say(f"{len(files)} file{'s' * (len(files) != 1)}, {bytes_text(size)}")
     print(out)
 
 

@@ -189,14 +189,15 @@ def gc(
 
     Example: `duagc gc --max 5G`
     """
+    from duagc.pipeline.base.byte_counts import bytes_text
     from duagc.pipeline.cache.garbage import collect
     from duagc.pipeline.cache.store import default_store
 
     place = store or default_store(out or Path("outputs/run"))
     done = collect(place, _bytes("--max", largest), dry)
     verb = "would be removed" if dry else "removed"
-    print(f"{place}: {done.entries} results {verb}, {done.freed_bytes / 1e6:.1f} MB")
-    print(f"{done.kept_entries} results remain, {done.kept_bytes / 1e6:.1f} MB")
+    print(f"{place}: {done.entries} results {verb}, {bytes_text(done.freed_bytes)}")
+    print(f"{done.kept_entries} results remain, {bytes_text(done.kept_bytes)}")
 
 
 def _bytes(option: str, text: str) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from duagc.pipeline.base.byte_counts import bytes_text
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.recording.folder import Recording
@@ -214,14 +215,14 @@ def format_info(content: Mapping[str, Any]) -> str:
 
 def _robot_table(robots: Mapping[str, Any]) -> list[str]:
     """One line per robot under a line of names."""
-    names = ("robot", "frames", "seconds", "rate Hz", "gaps", "MB", "with depth", "depth m (1, 50, 99 %)")
+    names = ("robot", "frames", "seconds", "rate Hz", "gaps", "size", "with depth", "depth m (1, 50, 99 %)")
     rows = [names]
     for robot, row in robots.items():
         color = row["topics"][topic_table.COLOR.of(robot)]
         depth = " ".join(f"{meters:.2f}" for meters in row["depth_m"] or ())
         rate = f"{color['rate_hz']:.2f}" if color["rate_hz"] else "-"
         seconds = f"{(row['end_ns'] - row['start_ns']) * 1e-9:.2f}"
-        size, share = f"{row['bytes'] / 1e6:.1f}", f"{row['with_depth']:.0%}"
+        size, share = bytes_text(row["bytes"]), f"{row['with_depth']:.0%}"
         rows.append(
             (robot, str(row["frames"]), seconds, rate, str(color["gaps"]), size, share, depth or "none")
         )
@@ -267,7 +268,7 @@ def _log_lines(log: Mapping[str, Any], indent: str = "") -> list[str]:
     span = "no messages"
     if log["start_ns"] is not None:
         span = f"{log['messages']} messages, {log['start_ns'] * 1e-9:.3f} to {log['end_ns'] * 1e-9:.3f} s"
-    size, digest = f"{log['bytes'] / 1e6:.1f} MB", log["digest"] or "not recorded"
+    size, digest = bytes_text(log["bytes"]), log["digest"] or "not recorded"
     first = f"{indent}{log['robot'] or 'team'}: {span}, {size}, digest {digest}"
     return [first, *_topic_lines(log["topics"], indent + "  ")]
 

@@ -8,22 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from duagc.pipeline.base.byte_counts import bytes_text
 from duagc.pipeline.evaluation.rendering import CENTRAL, COMPARED, COMPARED_SETS
 from duagc.pipeline.evaluation.results import reason_of, unit_of
 
 NONE = "–"
-
-
-def bytes_text(count: float) -> str:
-    """Bytes with a decimal prefix: 1 kB is 1000 B.
-
-    Args:
-        count: number of bytes.
-    """
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count:.0f} B" if float(count).is_integer() else f"{count:.1f} B"
 
 
 def meters_text(value_m: float) -> str:

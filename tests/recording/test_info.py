@@ -36,7 +36,7 @@ def test_info_of_a_recording(tmp_path: Path) -> None:
     assert content["warnings"] == []
     assert json.loads(json.dumps(content)) == content
     assert alpha["depth_m"][0] < alpha["depth_m"][1] < alpha["depth_m"][2] < 5
-    assert re.search(r"alpha +4 +0\.10 +30\.00 +0 +0\.0 +100%", format_info(content))
+    assert re.search(r"alpha +4 +0\.10 +30\.00 +0 +[\d.]+ kB +100%", format_info(content))
 
 
 def test_info_of_images_with_a_lens(tmp_path: Path) -> None:

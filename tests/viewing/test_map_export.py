@@ -1,6 +1,7 @@
 """Maps for other programs: tiles hold every Gaussian once, a point cloud says how good each point is."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,7 @@ def test_the_command_writes_an_export_and_replaces_nothing_else(fake, tmp_path: 
     words = ["export", str(fake.run), "--points", "--tile", "1", "--out", str(out)]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
+    assert re.search(r"^duagc: \d+ files, [\d.]+ kB$", result.output, re.MULTILINE)
     assert (out / "export.json").is_file()
     with pytest.raises(DuagError, match="exists already"):
         CliRunner().invoke(app, words, catch_exceptions=False)
