@@ -239,14 +239,17 @@ def _say_advice(run_folder: Path, recording: Path) -> None:
 
 
 def _print_outputs(run_folder: Path) -> None:
-    for name, pattern in (
-        ("report", "report/index.html"),
-        ("view", "run.rrd"),
-        ("map", "robots/*/refined.ply"),
-        ("metrics", "metrics.json"),
+    from duagc.pipeline.runs.folder import RunFolder
+
+    for name, paths in (
+        ("report", [run_folder / "report" / "index.html"]),
+        ("view", [run_folder / "run.rrd"]),
+        ("map", RunFolder(run_folder).final_maps),
+        ("metrics", [run_folder / "metrics.json"]),
     ):
-        for path in sorted(run_folder.glob(pattern)):
-            print(f"{name:<10} {path}")
+        for path in paths:
+            if path.is_file():
+                print(f"{name:<10} {path}")
 
 
 @app.command()

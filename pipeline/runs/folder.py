@@ -31,6 +31,7 @@ from duagc.pipeline.messages import (
 from duagc.pipeline.recording import Recording, read_exposures, read_log, stated_digest
 from duagc.pipeline.runs.digest import digest_file
 from duagc.pipeline.runs.metrics import sound_metrics
+from duagc.pipeline.splat.ply import gaussians_in_ply
 from duagc.schemas import topics
 
 SCHEMA = 1  # of manifest.json
@@ -215,6 +216,11 @@ class RunFolder:
         return min(
             members.values(), key=lambda names: (-len({robot_of(n) for n in names}), -len(names), names)
         )
+
+    @property
+    def final_maps(self) -> list[Path]:
+        """The files of the final maps that are there, by robot, without those of no Gaussian."""
+        return [path for path in sorted(self.path.glob("robots/*/refined.ply")) if gaussians_in_ply(path)]
 
     @property
     def calibration(self) -> list[str]:

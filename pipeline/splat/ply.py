@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import new_file, read_bytes
+from duagc.pipeline.base.files import check_file, new_file, read_bytes
 from duagc.pipeline.splat.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814  # color = 0.5 + SH_DEGREE_0 * coefficient
@@ -97,9 +97,31 @@ def read_ply(path: str | Path) -> Gaussians:
     )
 
 
+def gaussians_in_ply(path: Path) -> int:
+    """How many Gaussians a degree-0 3DGS .ply says that it holds; only its header is read.
+
+    Args:
+        path: of the file.
+    Raises:
+        DuagError: it is not such a file.
+    """
+    check_file(path, "a map")
+    with path.open("rb") as file:
+        return _head(file.read(_HEADER_LIMIT_BYTES), path)[0]
+
+
 def _read_table(path: Path) -> NDArray[np.float32]:
     """The vertices as float32 [n, 17] after a strict check of the header and of the file's length."""
     data = read_bytes(path, "a map")
+    count, start = _head(data, path)
+    body, row_bytes = data[start:], 4 * len(PROPERTIES)
+    if len(body) != count * row_bytes:
+        raise DuagError(f"{path}: {len(body)} bytes of vertices, expected {count * row_bytes}")
+    return np.frombuffer(body, dtype="<f4").reshape(-1, len(PROPERTIES))
+
+
+def _head(data: bytes, path: Path) -> tuple[int, int]:
+    """How many vertices follow a strictly checked header, and at which byte."""
     end = data.find(b"end_header\n", 0, _HEADER_LIMIT_BYTES)
     if not data.startswith(b"ply\n") or end < 0:
         raise DuagError(f"{path}: not a .ply file, expected a map of Gaussians")
@@ -112,7 +134,4 @@ def _read_table(path: Path) -> NDArray[np.float32]:
         raise DuagError(f"{path}: first element is '{lines[1]}', expected 'element vertex N'")
     if lines[2:] != [f"property float {name}" for name in PROPERTIES]:
         raise DuagError(f"{path}: properties differ from {' '.join(PROPERTIES)}, all float, in this order")
-    body, row_bytes = data[end + len(b"end_header\n") :], 4 * len(PROPERTIES)
-    if len(body) != int(words[2]) * row_bytes:
-        raise DuagError(f"{path}: {len(body)} bytes of vertices, expected {int(words[2]) * row_bytes}")
-    return np.frombuffer(body, dtype="<f4").reshape(-1, len(PROPERTIES))
+    return int(words[2]), end + len(b"end_header\n")

@@ -9,14 +9,18 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from duagc.pipeline import cli
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
+from duagc.pipeline.cli import runs as commands
+from duagc.pipeline.splat.ply import write_ply
 from tests.fixtures import fake_run
 from tests.fixtures.commands import ROOT, assert_one_line, duagc, duagc_here, listen_to_interrupts
+from tests.fixtures.noisy_wall import wall
 from tests.fixtures.recording_logs import write_camera
 from tests.fixtures.ros_bags import Ros, still
 
@@ -28,6 +32,15 @@ def test_help_is_there_for_every_command() -> None:
     text = duagc("--help").stdout
     assert all(name in text for name in names)
     assert "Example" in duagc_here("run", "--help").stdout
+
+
+def test_a_map_without_gaussians_is_not_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    some = wall()
+    for robot, gaussians in (("alpha", some.select(np.arange(0))), ("bravo", some)):
+        (tmp_path / "robots" / robot).mkdir(parents=True)
+        write_ply(tmp_path / "robots" / robot / "refined.ply", gaussians)
+    commands._print_outputs(tmp_path)
+    assert capsys.readouterr().out.split() == ["map", str(tmp_path / "robots" / "bravo" / "refined.ply")]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.ply import PROPERTIES, SH_DEGREE_0, read_ply, write_ply
+from duagc.pipeline.splat.ply import PROPERTIES, SH_DEGREE_0, gaussians_in_ply, read_ply, write_ply
 
 
 def some(n: int = 7, seed: int = 0) -> Gaussians:
@@ -50,7 +50,7 @@ def test_round_trip(tmp_path: Path, n: int) -> None:
     gaussians = some(n)
     write_ply(tmp_path / "map.ply", gaussians)
     back = read_ply(tmp_path / "map.ply")
-    assert len(back) == n
+    assert (len(back), gaussians_in_ply(tmp_path / "map.ply")) == (n, n)
     for name in ("means", "log_scales", "opacity_logits"):
         np.testing.assert_array_equal(getattr(back, name), getattr(gaussians, name))
     np.testing.assert_allclose(back.colors, gaussians.colors, atol=2e-7)  # two float32 roundings
