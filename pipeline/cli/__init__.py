@@ -1,5 +1,6 @@
 """The command `duagc`. Every command imports what it needs when it runs, so that `--help` is quick."""
 
+import os
 import sys
 from io import TextIOWrapper
 
@@ -53,6 +54,10 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
             stream.reconfigure(errors="replace")  # a terminal may lack a letter of a name
+    if os.environ.get("COLUMNS", "").strip("0") == "":
+        os.environ.pop(
+            "COLUMNS", None
+        )  # of a terminal that does not know its width; Rich would take it at its word
     try:
         with ending_as_interrupts():
             app()

@@ -34,6 +34,11 @@ def test_help_is_there_for_every_command() -> None:
     assert "Example" in duagc_here("run", "--help").stdout
 
 
+def test_help_is_there_on_a_terminal_that_does_not_know_its_width(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "0")
+    assert "simulate" in duagc("--help").stdout
+
+
 def test_a_map_without_gaussians_is_not_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     some = wall()
     for robot, gaussians in (("alpha", some.select(np.arange(0))), ("bravo", some)):
