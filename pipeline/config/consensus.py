@@ -16,9 +16,9 @@ WeightKind = Literal["uniform", "observation_count", "residual_magnitude", "scal
 class LoopClosureConfig(Config):
     """Noise of loop closures and tests of their mutual consistency."""
 
-    sigma_floor_m: float = Field(default=0.005, ge=0.0)
+    sigma_floor_m: float = Field(default=0.005, gt=0.0)
     """Added to every loop closure's covariance: registration reports only the noise of its pixels, not its bias (m)."""
-    sigma_floor_rad: float = Field(default=0.003, ge=0.0)
+    sigma_floor_rad: float = Field(default=0.003, gt=0.0)
     """The same for its rotation (rad)."""
     drift_floor_m: float = Field(default=0.005, ge=0.0)
     """Least assumed drift of the odometry from one keyframe to the next (m)."""

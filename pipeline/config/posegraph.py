@@ -10,11 +10,21 @@ from duagc.pipeline.config.consensus import LoopClosureConfig, PoseConsensusConf
 Solver = Literal["admm", "elimination", "paper"]
 Robust = Literal["none", "gnc"]
 
-_AS_GIVEN = LoopClosureConfig(
-    sigma_floor_m=0, sigma_floor_rad=0, drift_floor_m=0, drift_floor_rad=0, min_support=1,
-    frame_sigma_m=5.0, frame_sigma_rad=0.1,
-)  # fmt: skip
 _ROBUST_PENALTY = 0.1
+
+
+class GivenLoopClosureConfig(LoopClosureConfig):
+    """Loop closures with covariances that count as they are."""
+
+    sigma_floor_m: float = Field(default=0.0, ge=0.0)
+    """Added to every loop closure's covariance (m)."""
+    sigma_floor_rad: float = Field(default=0.0, ge=0.0)
+    """The same for its rotation (rad)."""
+
+
+_OF_A_FILE = GivenLoopClosureConfig(
+    drift_floor_m=0, drift_floor_rad=0, min_support=1, frame_sigma_m=5.0, frame_sigma_rad=0.1
+)
 
 
 class TeamConsensusConfig(PoseConsensusConfig):
@@ -29,6 +39,8 @@ class TeamConsensusConfig(PoseConsensusConfig):
     """Packets received between two of these."""
     drop_idle: bool = True
     """After the schedule, share only keyframes that a loop closure with weight names: the others slow the rest."""
+    closures: GivenLoopClosureConfig = GivenLoopClosureConfig()
+    """Noise and consistency of loop closures."""
 
     def team_schedule(self) -> TeamSchedule:
         """What is added to the schedule of robust weights."""
@@ -53,7 +65,7 @@ class PoseGraphConfig(Config):
         wire="float32",
         odometry_floor_m=0,
         odometry_floor_rad=0,
-        closures=_AS_GIVEN,
+        closures=_OF_A_FILE,
         robust=False,
         robust_skip=False,
         robust_convexity=0.0,

@@ -98,6 +98,8 @@ def test_a_section_is_introduced_by_its_first_paragraph() -> None:
     [
         "frontend.tracking.registration.huber_sigmas=0",
         "exchange.verification.registration.huber_sigmas=0",
+        "exchange.consensus.closures.sigma_floor_m=0",
+        "exchange.consensus.closures.sigma_floor_rad=0",
         "frontend.tracking.equalize_from_gain=0.9",
         "frontend.tracking.max_keyframe_gain=0",
         "frontend.mapping.loss.blended.color_huber=0",

@@ -5,8 +5,7 @@ import pytest
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.consensus import LoopClosureConfig
-from duagc.pipeline.config.posegraph import settings
+from duagc.pipeline.config.posegraph import GivenLoopClosureConfig, settings
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.edges import KIMERA_COLUMNS, read_g2o, read_kimera
@@ -16,7 +15,7 @@ from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePo
 from duagc.pipeline.team_posegraph.solve import solve
 from tests.fixtures.pose_graphs import KAPPA, TAU, g2o_line, helix, helix_edges, symbol, write_g2o, write_team
 
-EXACT = LoopClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)
+EXACT = GivenLoopClosureConfig()
 
 
 def team_cost(team, T_by_robot):
