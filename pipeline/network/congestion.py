@@ -151,8 +151,13 @@ class SendRate:
         guessed: a first limit was taken from the other direction.
     """
 
-    def __init__(self) -> None:
-        """There is no limit."""
+    def __init__(self, largest_packet_bytes: int = MAX_PACKET_BYTES) -> None:
+        """There is no limit.
+
+        Args:
+            largest_packet_bytes: headers included; so much of a budget can wait for the next round.
+        """
+        self._largest_packet_bytes = largest_packet_bytes
         self.limit: float | None = None
         self.guessed = False
         self._answered_round = self._pause_until = self._raised_round = -1
@@ -239,7 +244,7 @@ class SendRate:
             round_trip + FULL_ROUNDS + WINDOW_ROUNDS
         )  # after which a report of the last try would be here
         self._queued = 0.0 if self.limit is None else max(0.0, self._queued + sent_bytes - self.limit)
-        self._left = float(min(left_bytes, MAX_PACKET_BYTES)) if more else 0.0
+        self._left = float(min(left_bytes, self._largest_packet_bytes)) if more else 0.0
         if (
             self.limit is None
             or not more

@@ -23,6 +23,7 @@ from duagc.pipeline.network.messages import Arrival, Message, Outgoing
 from duagc.pipeline.network.packets import (
     EVIDENCE_KINDS,
     HEADER_BYTES,
+    MAX_PACKET_BYTES,
     MAX_PAYLOAD_BYTES,
     URGENT_KINDS,
     Kind,
@@ -70,7 +71,8 @@ class Transport:
         self.own, self.peer, self.peer_name, self.config = own, peer, peer_name, config
         self.new_id = new_id
         self._seal = serialize if identity is None else identity.seal
-        self._overhead_bytes = HEADER_BYTES + (0 if identity is None else SIGNATURE_BYTES)
+        signature_bytes = 0 if identity is None else SIGNATURE_BYTES
+        self._overhead_bytes = HEADER_BYTES + signature_bytes
         self.sequence = 0
         self.last_heard: int | None = None
         self._open: dict[int, OpenMessage] = {}
@@ -80,7 +82,7 @@ class Transport:
         self._packets_heard = self._highest_sequence = 0
         self._heard: dict[int, int] = {}  # sequence numbers, a mask for each block of SEQUENCE_BLOCK
         self._observer = LinkObserver()
-        self._rate = SendRate()
+        self._rate = SendRate(MAX_PACKET_BYTES + signature_bytes)
 
     # --- outgoing
 

@@ -1,6 +1,7 @@
 """In which rounds a transport sends chunks and acknowledgements again, and what a single acknowledgement says."""
 
 import itertools
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from duagc.pipeline.config.network import TransportConfig
 from duagc.pipeline.network.congestion import Congestion
 from duagc.pipeline.network.messages import Message
-from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES, Kind, Packet, parse
+from duagc.pipeline.network.packets import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Kind, Packet, parse
+from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
 from duagc.pipeline.network.transport import ACK_CHUNKS, Transport
 
 CONFIG = TransportConfig(retransmit_after_rounds=3, contact_lost_after_rounds=4)
@@ -159,3 +161,19 @@ def test_an_acknowledgement_of_more_chunks_than_there_are_has_no_effect() -> Non
     )  # fmt: skip
     assert a.receive(ack, 0) is None
     assert not a._open[7].acknowledged.any()
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_the_slowest_link_sends_whole_packets(signed: bool) -> None:
+    """What is left of 50 bytes a round adds up to a packet, also to one with a signature behind it."""
+    identity = Identity.simulated(0, ["alpha", "bravo"], "alpha") if signed else None
+    ids = itertools.count(1)
+    sender = Transport(0, 1, "bravo", TransportConfig(), new_id=ids.__next__, identity=identity)
+    report = struct.pack("<IIHI", 2**32 - 1, 50, 2, 0)  # 50 bytes a round, two rounds late
+    sender.receive(replace(state(0, 0), kind=Kind.ACK, total=len(report), payload=report), 0)
+    size = MAX_PACKET_BYTES + SIGNATURE_BYTES * signed
+    lengths = list[int]()
+    for now in range(2, 3 + size // 50):
+        burst = sender.burst(now, [Message(next(ids), Kind.STATE, bytes(MAX_PAYLOAD_BYTES))], BUDGET_BYTES)
+        lengths += [len(out.packet) for out in burst]
+    assert lengths == [size]
