@@ -11,13 +11,16 @@ from duagc.pipeline.config.registration import GeometricVerificationConfig, Gicp
 
 EvidenceOrder = Literal["gain", "paper", "random", "reversed"]
 
+_MOST_COUNTED = 2**16 - 1  # by the messages of loop closing
+_MOST_SAMPLES = _MOST_COUNTED // 4  # tiles of a whole number of pixels may be up to four times as many
+
 
 class PlacesConfig(Config):
     """Place descriptors and candidates for loop closures."""
 
-    features_per_place: int = Field(default=80, ge=4)
+    features_per_place: int = Field(default=80, ge=4, le=_MOST_COUNTED)
     """Descriptors of one keyframe that a neighbor gets to recognize the place (128 bytes each)."""
-    features_per_keyframe: int = Field(default=400, ge=4)
+    features_per_keyframe: int = Field(default=400, ge=4, le=_MOST_COUNTED)
     """Descriptors with 3-D points of one keyframe, for verification."""
     ratio: float = Field(default=0.8, gt=0.0, lt=1.0)
     """Nearest over second-nearest distance below which a match counts."""
@@ -71,7 +74,7 @@ class VerificationConfig(GeometricVerificationConfig):
     """Standard deviation of the translation of a loop closure where all are alike."""
     alike_sigma_rad: float = Field(default=0.003, gt=0.0)
     """The same for its rotation."""
-    samples: int = Field(default=2000, ge=50)
+    samples: int = Field(default=2000, ge=50, le=_MOST_SAMPLES)
     """Points with normal and intensity of the neighbor's keyframe used by the registration."""
     min_overlap: float = Field(default=0.2, ge=0.0, le=1.0)
     """Overlap that the registration must find, of what the own camera can see of the neighbor's samples."""

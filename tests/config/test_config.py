@@ -98,6 +98,9 @@ def test_a_section_is_introduced_by_its_first_paragraph() -> None:
     [
         "frontend.tracking.registration.huber_sigmas=0",
         "exchange.verification.registration.huber_sigmas=0",
+        "exchange.verification.samples=70000",
+        "exchange.places.features_per_keyframe=70000",
+        "exchange.places.features_per_place=70000",
         "exchange.consensus.closures.sigma_floor_m=0",
         "exchange.consensus.closures.sigma_floor_rad=0",
         "frontend.tracking.equalize_from_gain=0.9",
