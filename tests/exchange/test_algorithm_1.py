@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig
@@ -117,6 +118,25 @@ def test_messages_are_read_as_they_were_written() -> None:
     assert np.allclose(np.concatenate([values for _, values in parts]), means, atol=1e-6)
     with pytest.raises(MalformedError, match="more Gaussians"):
         read_means(write_means(means, 1000)[-1], 199)
+
+
+def test_a_loop_closure_may_say_nothing_of_a_direction() -> None:
+    """Rounding leaves the information there a little above or below zero."""
+    rng, poses = np.random.default_rng(0), np.eye(4)[None]
+
+    def read(information: Array) -> LoopClosure:
+        closure = LoopClosure(0, 0, np.eye(4), information)
+        return read_setup(write_setup(LinkSetup(poses, (closure,))), 1, "Algorithm 1").closures[0]
+
+    for _ in range(20):
+        J = rng.normal(size=(5, 6)) * rng.uniform(1, 1e3, 6)
+        information = J.T @ J
+        np.testing.assert_array_equal(read(information).information, information)
+    skew = np.zeros((6, 6))
+    skew[0, 1] = 1e-3 * information.max()
+    for wrong in (-np.eye(6), 1e16 * np.eye(6), information + skew):
+        with pytest.raises(MalformedError, match="too large, not symmetric or negative"):
+            read(wrong)
 
 
 def test_without_gaussians_there_is_nothing_to_solve(team: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array, array_bytes
-from duagc.pipeline.exchange.wire.reader import Reader, pose_bytes
+from duagc.pipeline.exchange.wire.reader import Reader, check_information, pose_bytes
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
 
@@ -167,9 +167,7 @@ def _read_factors(reader: Reader, count: int) -> tuple[Index, Array, Array]:
     information = np.zeros((count, 6, 6))
     information[:, _UPPER[0], _UPPER[1]] = upper
     information[:, _UPPER[1], _UPPER[0]] = upper
-    values = np.linalg.eigvalsh(information)
-    if not np.all(values[:, 0] >= -1e-6 * np.maximum(values[:, -1], 0.0)):
-        raise MalformedError("graphs: information that is negative")
+    check_information(information, "graphs")
     return ends, T, information
 
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-import numpy as np
-
 from duagc.pipeline.base.arrays import Array, array_bytes
-from duagc.pipeline.exchange.wire.reader import MAX_INFORMATION, MAX_KEYFRAMES, Reader, pose_bytes
+from duagc.pipeline.exchange.wire.reader import MAX_KEYFRAMES, Reader, check_information, pose_bytes
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 
@@ -63,8 +61,7 @@ def read_setup(data: bytes, keyframes: int, solver: str) -> LinkSetup:
         T, information = reader.poses(1)[0], reader.array("float64", (6, 6))
         if own >= n or peer >= keyframes or from_peer > 1:
             raise MalformedError(f"{solver}: a loop closure of a keyframe that does not exist")
-        if np.abs(information).max() > MAX_INFORMATION or np.linalg.eigvalsh(information)[0] < 0.0:
-            raise MalformedError(f"{solver}: impossible information of a loop closure")
+        check_information(information[None], solver)
         closures.append(LoopClosure(own, peer, T, information, bool(from_peer)))
     reader.done()
     return LinkSetup(poses, tuple(closures))

@@ -21,6 +21,9 @@ MAX_KEYFRAMES = 100_000
 MAX_COORDINATE = 1e6  # m, or units of theta; beyond it positions lose their meaning
 MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
 ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbor sent
+INFORMATION_TOLERANCE = (
+    1e-6  # of the largest entry: sums of many residuals say next to nothing of some directions
+)
 
 
 class Reader:
@@ -103,6 +106,25 @@ class Reader:
         part = self.data[self.position : self.position + size]
         self.position += size
         return part
+
+
+def check_information(information: Array, what: str) -> None:
+    """Refuse information that no measurement gives; rounding may leave it a little below zero.
+
+    Args:
+        information: [n, 6, 6], of relative poses, right tangent (m, rad).
+        what: name of the message, for errors.
+
+    Raises:
+        MalformedError: some is beyond `MAX_INFORMATION`, not symmetric, or negative.
+    """
+    largest = np.abs(information).max(axis=(1, 2), initial=0.0)
+    skew = np.abs(information - np.swapaxes(information, -1, -2)).max(axis=(1, 2), initial=0.0)
+    least = np.linalg.eigvalsh(information).min(axis=1, initial=0.0)
+    if np.any(largest > MAX_INFORMATION) or np.any(
+        np.maximum(skew, -least) > INFORMATION_TOLERANCE * largest
+    ):
+        raise MalformedError(f"{what}: information that is too large, not symmetric or negative")
 
 
 def pose_bytes(T: Array) -> bytes:
