@@ -21,6 +21,7 @@ from duagc.converters.logs.motion import IMU_TYPE, POSE_TYPES
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import Source, is_log, pieces_words, robot_of, sources_of, unread
 from duagc.converters.logs.video import is_video
+from duagc.pipeline.base.byte_counts import bytes_text
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import size_bytes
 from duagc.pipeline.base.progress import track
@@ -251,7 +252,7 @@ def _log_lines(name: str, log: Mapping[str, Any]) -> list[str]:
         span = f"{seconds:.2f} s from {log['start_ns'] / NANOSECONDS:.3f} s"
     pieces = f" in {len(log['pieces'])} pieces" if len(log["pieces"]) > 1 else ""
     lines = [
-        f"log {name}{pieces}: {log['bytes'] / 1e6:.1f} MB, {span}, times: {', '.join(log['time_sources'])}"
+        f"log {name}{pieces}: {bytes_text(log['bytes'])}, {span}, times: {', '.join(log['time_sources'])}"
     ]
     width = max((len(topic) for topic in log["topics"]), default=0)
     for topic, t in log["topics"].items():

@@ -247,7 +247,7 @@ def measure(log: Path, folder: Path, config: FrontendConfig, *, seed: int, threa
         "times": times,
         "laps_wall_s": laps,
         "cpu_s": cpu_s,
-        "peak_memory_mb": peak_memory_bytes() / 2**20,
+        "peak_memory_mb": peak_memory_bytes() / 1e6,
     }
 
 
@@ -333,7 +333,7 @@ def measure_open3d(log: Path, method: str) -> dict[str, Any]:
             stamps.append(frame.stamp_ns)
     return {
         "times": {"frame": summary(calls)},
-        "peak_memory_mb": peak_memory_bytes() / 2**20,
+        "peak_memory_mb": peak_memory_bytes() / 1e6,
         "stamps_ns": np.array(stamps, dtype=np.int64),
         "poses": np.array(poses),
         "failed": failed,

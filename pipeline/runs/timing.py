@@ -62,7 +62,7 @@ class Timing:
             "robot": robot,
             "wall_s": round(time.perf_counter() - wall, 3),
             "cpu_s": round(_processor_s() - cpu, 3),
-            "peak_rss_mb": round(peak_memory_bytes() / 2**20, 1),
+            "peak_rss_mb": round(peak_memory_bytes() / 1e6, 1),
         }
 
     def went_on(self, name: str, wall_s: float, cpu_s: float) -> None:

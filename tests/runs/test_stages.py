@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.workers import peak_memory_bytes
 from duagc.pipeline.messages import Odometry
 from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.stages import Stage
+from duagc.pipeline.runs.timing import Timing
 from duagc.schemas import topics
 from tests.fixtures import fake_run
 
@@ -34,6 +36,15 @@ def test_every_topic_of_a_stage_is_written_by_its_producer_and_no_other() -> Non
     for topic in topics.TOPICS:
         writers = [stage.name for stage in stages.STAGES if topic in stage.writes]
         assert writers == ([] if topic.producer == "converters" else [topic.producer]), topic.pattern
+
+
+def test_memory_is_measured_in_millions_of_bytes() -> None:
+    """As it is predicted (`cache.footprint`) and shown."""
+    timing = Timing()
+    with timing.measured("fusion", "alpha"):
+        pass
+    held_mb = timing.stages["fusion.alpha"]["peak_rss_mb"]
+    assert held_mb == pytest.approx(peak_memory_bytes() / 1e6, rel=0.01)
 
 
 def test_a_stage_cannot_declare_a_topic_of_another_producer() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,7 @@ def test_topics_rates_and_choices_are_shown(tmp_path: Path) -> None:
     assert shown.exit_code == 0
     assert "  color       /camera/color/image_raw: the only images that are color" in shown.stdout
     assert "20.00 Hz  sensor_msgs/msg/Image  recorded 0.005 s after its header" in shown.stdout
+    assert re.search(r"^log \S+: [\d.]+ kB, ", shown.stdout, re.MULTILINE)
     assert json.loads(run.invoke(app, ["info", str(bag), "--json"]).stdout)["robots"].keys() == {"alpha"}
 
 
