@@ -207,26 +207,7 @@ def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
         description, rows = {"name": name, "source": {"folder": source.resolve().name}}, {}
         warnings = [f"{RECORDING_FILE} was lost and made again from the logs"]
         salvaged.append(Salvage(RECORDING_FILE, damage=["made again from the logs"]))
-    for path in sorted(source.iterdir()):
-        if not path.name.endswith((".mcap", ".mcap.part")) or path.is_dir():
-            continue
-        try:
-            if not path.is_file() or path.is_symlink():
-                raise DuagError(f"{path}: is no file of this folder, expected a log")
-            salvage = _recover_log(path, folder / path.name.removesuffix(".part"))
-        except DuagError as error:
-            cause = error.__cause__
-            if (
-                isinstance(cause, OSError) and cause.errno != errno.EINVAL
-            ):  # the log may be whole: no room, no right
-                raise
-            reason = str(error).partition(": ")[2]
-            warnings.append(f"{path.name} is lost: {reason}")
-            salvaged.append(Salvage(path.name, damage=[reason]))
-            continue
-        salvaged.append(salvage)
-        if not salvage.whole:
-            warnings.append(f"recovered: {salvage.line()}")
+    salvaged += _recover_logs(source, folder, warnings)
     robots = {}
     for path in sorted(folder.glob("*.mcap")):
         if path.name.endswith(TRUTH):
@@ -254,6 +235,44 @@ def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
     with new_file(folder / RECORDING_FILE) as part:
         part.write_text(json.dumps(description, indent=2) + "\n")
     return salvaged
+
+
+def _recover_logs(source: Path, folder: Path, warnings: list[str]) -> list[Salvage]:
+    """Every log of a folder; of two that would have one name, that with more messages."""
+    found = dict[str, Salvage]()  # by name of the recovered log
+    others, said = list[Salvage](), dict[str, str]()  # and warnings, by name of the file
+    for path in sorted(source.iterdir()):
+        if not path.name.endswith((".mcap", ".mcap.part")) or path.is_dir():
+            continue
+        name = path.name.removesuffix(".part")
+        try:
+            if not path.is_file() or path.is_symlink():
+                raise DuagError(f"{path}: is no file of this folder, expected a log")
+            salvage = _recover_log(path, folder / path.name)
+        except DuagError as error:
+            cause = error.__cause__
+            if (
+                isinstance(cause, OSError) and cause.errno != errno.EINVAL
+            ):  # the log may be whole: no room, no right
+                raise
+            reason = str(error).partition(": ")[2]
+            said[path.name] = f"{path.name} is lost: {reason}"
+            others.append(Salvage(path.name, damage=[reason]))
+            continue
+        before = found.get(name)
+        if before is not None and before.messages >= salvage.messages:
+            (folder / path.name).unlink()
+            salvage, before = before, salvage
+        elif path.name != name:
+            os.replace(folder / path.name, folder / name)
+        found[name] = salvage
+        if before is not None:
+            reason = f"is not carried over: {salvage.path} has {salvage.messages} messages"
+            said[before.path] = f"{before.path} with {before.messages} messages {reason}"
+            others.append(Salvage(before.path, before.messages, damage=[reason]))
+    said |= {s.path: f"recovered: {s.line()}" for s in found.values() if not s.whole}
+    warnings += [text for _, text in sorted(said.items())]
+    return sorted([*found.values(), *others], key=lambda salvage: salvage.path)
 
 
 def _describe(path: Path) -> tuple[str, dict[str, Any]]:

@@ -254,6 +254,19 @@ def test_a_conversion_that_was_killed_is_saved(tmp_path: Path) -> None:
     assert any("bravo.groundtruth.mcap is lost" in text for text in saved.description["warnings"])
 
 
+@pytest.mark.parametrize("shorter", ["bravo.mcap", "bravo.mcap.part"])
+def test_of_two_logs_of_one_name_the_longer_one_is_kept(tmp_path: Path, shorter: str) -> None:
+    """What a program left that was killed while it wrote the log anew does not replace the log."""
+    rec = large_recording(tmp_path / "rec")
+    data, digest = (rec / "bravo.mcap").read_bytes(), content_digest(rec / "bravo.mcap")
+    for name in ("bravo.mcap", "bravo.mcap.part"):
+        (rec / name).write_bytes(data[: len(data) // 2] if name == shorter else data)
+    found = {salvage.path: salvage for salvage in recovery.recover(rec, tmp_path / "saved")}
+    assert content_digest(tmp_path / "saved" / "bravo.mcap") == digest
+    assert min(salvage.messages for salvage in found.values()) == found[shorter].messages > 0
+    assert "is not carried over" in found[shorter].line()
+
+
 def test_what_holds_nothing_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(1000))
     (tmp_path / "empty").mkdir()
