@@ -9,47 +9,35 @@ without, with extrinsics from the log's constant transforms or given ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from duagc.converters.layouts.ros_images import (
-    UnusableImage,
-    check_decodes,
-    color_bytes,
-    depth_values,
-    encoded_size,
-    in_meters,
-)
+from duagc.converters.layouts.ros_images import UnusableImage
 from duagc.converters.layouts.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from duagc.converters.logs import Log, open_log
 from duagc.converters.logs.clocks import LEAST_OFFSET_S, angular_speed, compare, lag, overlap_warnings
 from duagc.converters.logs.derived import Picture, Sweeps
 from duagc.converters.logs.describe import namespaces
+from duagc.converters.logs.measured_frames import FARTHEST, measured, rules_of_depth
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import Source, piece_before, pieces_words, sources_of, unread
-from duagc.converters.logs.unmeasured import first_depths, float_unit_m
 from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.atomic_folder import check_apart
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages.parts import NANOSECONDS
-from duagc.pipeline.recording.greatest_depth import SATURATED, unmeasured
-from duagc.pipeline.recording.register_depth import register_depth
 
 Options = LogOptions
-FARTHEST = SATURATED - 1  # in units of depth
 TRUTH_REMEDY = "--set truth_offset_s=SECONDS to add to the poses' times, or --set time_source=log"
 
 
@@ -184,43 +172,28 @@ def write_robot(
 
 
 def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: int) -> dict[str, Any]:
-    log, pairs, derived = source.name, source.pairs, source.derived
+    pairs, derived = source.pairs, source.derived
     readings, rows = _Readings(robot, source), source.check_rows()
     if isinstance(derived, Sweeps):
         robot.set_lidar(derived.T_camera_lidar, derived.range_sigma_m)
-    check = ReprojectionCheck(source.camera, len(pairs), gap)
-    rules = _rules_of_depth(source)
-    without = empty = far = lost = 0
-    cut: list[UnusableImage] = []
+    check, left_out = ReprojectionCheck(source.camera, len(pairs), gap), _LeftOut()
     written: set[int] = set()
-
-    def pictured(frame: tuple[int, Any, Any]) -> tuple[int, Picture | UnusableImage, int]:
-        stamp_ns, color, depth = frame
-        try:
-            if derived:
-                partner_ns = pairs[stamp_ns]
-                assert partner_ns is not None  # or there would be nothing to derive depth from
-                return stamp_ns, derived.picture(color, depth, stamp_ns, partner_ns), 0
-            return stamp_ns, *_measured(source, stamp_ns, color, depth, rules=rules)
-        except UnusableImage as error:
-            return stamp_ns, error, 0
-
-    # what is derived may depend on the frames before
-    found = in_order(pictured, source.frames(), threads=1 if derived else None)
-    for index, (stamp_ns, picture, beyond) in enumerate(track(found, f"convert {robot.name}", len(pairs))):
+    for index, (stamp_ns, picture, beyond) in enumerate(
+        track(_pictures(source), f"convert {robot.name}", len(pairs))
+    ):
         if isinstance(picture, UnusableImage):
-            cut.append(picture)
+            left_out.cut.append(picture)
             continue
-        far += beyond
         T = source.true_pose(stamp_ns)
-        without += T is None
         readings.write_until(stamp_ns)
         at_ns, encoded = source.written_ns(stamp_ns), (picture.color, picture.color_format)
         if picture.points_lidar is not None:
             robot.add_points(at_ns, picture.points_lidar)
         depth_ns = source.depth_stamp_ns(stamp_ns)
-        if not derived and picture.depth is None and pairs[stamp_ns] is not None:
-            lost, depth_ns = lost + 1, None
+        lost = not derived and picture.depth is None and pairs[stamp_ns] is not None
+        if lost:
+            depth_ns = None
+        left_out.add(picture, beyond=beyond, lost=lost, has_pose=T is not None)
         robot.add_frame(
             at_ns,
             *encoded,
@@ -235,101 +208,88 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
             at_depth = None if depth_ns is None else source.true_pose(pairs[stamp_ns])
             T_depth = T if at_depth is None else at_depth
             check.add(index, source.depth_m(picture), T_depth, picture.depth_sigma_m)
-        empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))
-    if len(cut) == len(pairs):
-        raise cut[0]
-    if cut:
-        source.warnings.append(f"{len(cut)} frames have color or depth that is cut short or broken; left out")
-    if lost and lost + len(cut) >= sum(depth_ns is not None for depth_ns in pairs.values()):
-        raise DuagError(
-            f"{log}: {source.depth}: {lost} images are cut short or broken, expected depth in some"
-        )
-    if lost:
-        source.warnings.append(f"{lost} frames have depth that is cut short or broken; their color is kept")
-    if far:
-        limit = FARTHEST * source.depth_scale
-        source.warnings.append(
-            f"{far} pixels are farther away than {limit:.1f} m, which depth can hold; left out"
-        )
+    left_out.warn(source)
     readings.write_until(np.iinfo(np.int64).max)
-    if source.truth is not None and without:
-        why = source.truth.body.missing_words(list(pairs), source.settings.max_pose_gap_s, TRUTH_REMEDY)
-        source.warnings.append(f"{without} of {len(pairs)} frames have no true pose: {why}")
     if not isinstance(derived, Sweeps):
-        with_depth = sum(depth_ns is not None for depth_ns in pairs.values()) - len(cut) - lost
-        rows["without_depth"] = empty / max(1, with_depth * source.camera.width * source.camera.height)
+        rows["without_depth"] = left_out.share_without_depth(source)
     drift = {} if source.drift is None else {"clock_drift_ppm": 1e6 * source.drift.rate}
-    return {**rows, **check.result(log, max_ratio), **_truth_lag(source), **drift}
+    return {**rows, **check.result(source.name, max_ratio), **_truth_lag(source), **drift}
 
 
-def _rules_of_depth(source: RobotLog) -> tuple[float, float]:
-    """Distance from which on depth images say nothing, meters (0: all counts), and meters per unit of floats."""
-    settings = source.settings
-    if source.derived is not None:
-        return settings.farthest_m, 1.0
-    held_out = {source.pairs[color] for index, color in enumerate(sorted(source.pairs)) if is_held_out(index)}
-    images = first_depths(source.log, source.depth, lambda entry: source.time_ns(entry) not in held_out)
-    stated_m = settings.depth_scale if "depth_scale" in settings.model_fields_set else None
-    limit_m, where = FARTHEST * source.depth_scale, f"{source.name}: {source.depth}"
-    unit_m = float_unit_m(images, limit_m, stated_m, where)
-    if settings.farthest_m:
-        return settings.farthest_m, unit_m
-    found_m, share = unmeasured([in_meters(image, settings.depth_scale, unit_m) for image in images])
-    if found_m:
-        source.warnings.append(
-            f"{share:.0%} of {source.depth} is exactly {found_m:.3f} m, the greatest: taken for none; "
-            "expected 0 where nothing was measured"
+def _pictures(source: RobotLog) -> Iterator[tuple[int, Picture | UnusableImage, int]]:
+    """Time of every frame, what is written of it or why nothing is, and how many pixels are too far away."""
+    derived, rules = source.derived, rules_of_depth(source)
+
+    def pictured(frame: tuple[int, Any, Any]) -> tuple[int, Picture | UnusableImage, int]:
+        stamp_ns, color, depth = frame
+        try:
+            if derived:
+                partner_ns = source.pairs[stamp_ns]
+                assert partner_ns is not None  # or there would be nothing to derive depth from
+                return stamp_ns, derived.picture(color, depth, stamp_ns, partner_ns), 0
+            return stamp_ns, *measured(source, stamp_ns, color, depth, rules=rules)
+        except UnusableImage as error:
+            return stamp_ns, error, 0
+
+    # what is derived may depend on the frames before
+    return in_order(pictured, source.frames(), threads=1 if derived else None)
+
+
+@dataclass
+class _LeftOut:
+    """What of the frames of a robot is not written.
+
+    Attributes:
+        cut: why frames are left out.
+        lost: frames whose depth is left out.
+        far: pixels that are farther away than depth can hold.
+        without: frames without a true pose.
+        empty: pixels without depth, of the images of depth.
+    """
+
+    cut: list[UnusableImage] = field(default_factory=list)
+    lost: int = 0
+    far: int = 0
+    without: int = 0
+    empty: int = 0
+
+    def add(self, picture: Picture, *, beyond: int, lost: bool, has_pose: bool) -> None:
+        self.far, self.lost, self.without = self.far + beyond, self.lost + lost, self.without + (not has_pose)
+        if picture.depth is not None:
+            self.empty += picture.depth.size - int(np.count_nonzero(picture.depth))
+
+    def warn(self, source: RobotLog) -> None:
+        """Say so; nothing may be all that is left."""
+        pairs, warnings = source.pairs, source.warnings
+        if len(self.cut) == len(pairs):
+            raise self.cut[0]
+        if self.cut:
+            warnings.append(
+                f"{len(self.cut)} frames have color or depth that is cut short or broken; left out"
+            )
+        if self.lost and self.lost + len(self.cut) >= sum(
+            depth_ns is not None for depth_ns in pairs.values()
+        ):
+            raise DuagError(
+                f"{source.name}: {source.depth}: {self.lost} images are cut short or broken, expected depth in some"
+            )
+        if self.lost:
+            warnings.append(f"{self.lost} frames have depth that is cut short or broken; their color is kept")
+        if self.far:
+            limit = FARTHEST * source.depth_scale
+            warnings.append(
+                f"{self.far} pixels are farther away than {limit:.1f} m, which depth can hold; left out"
+            )
+        if source.truth is not None and self.without:
+            why = source.truth.body.missing_words(list(pairs), source.settings.max_pose_gap_s, TRUTH_REMEDY)
+            warnings.append(f"{self.without} of {len(pairs)} frames have no true pose: {why}")
+
+    def share_without_depth(self, source: RobotLog) -> float:
+        """Of the pixels of all images of depth that were written."""
+        with_depth = (
+            sum(depth_ns is not None for depth_ns in source.pairs.values()) - len(self.cut) - self.lost
         )
-    return found_m, unit_m
-
-
-def _measured(
-    source: RobotLog, stamp_ns: int, color: Any, depth: Any | None, *, rules: tuple[float, float]
-) -> tuple[Picture, int]:
-    """A frame, with depth if there is any, and how many pixels are too far away for the log; rules: of depth."""
-    import cv2
-
-    farthest_m, float_unit = rules
-    log = source.name
-    where = f"{log}: {source.color} at {stamp_ns} ns"
-    data, color_format = color_bytes(color, where)
-    _check_size(where, encoded_size(data) or (0, 0), source.camera)
-    if hasattr(color, "format"):
-        check_decodes(data, where)
-    if depth is None:
-        return Picture(data, color_format), 0
-    where = f"{log}: {source.depth} at {stamp_ns} ns"
-    try:
-        values: NDArray[Any] = depth_values(depth, where)
-    except UnusableImage:
-        if source.settings.association != "all":
-            raise
-        return Picture(data, color_format), 0
-    _check_size(where, (values.shape[1], values.shape[0]), source.depth_camera.camera)
-    if farthest_m:
-        meters = in_meters(values, source.settings.depth_scale, float_unit)
-        values = np.where(meters < farthest_m, values, values.dtype.type(0))
-    if source.depth_maps is not None:
-        values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
-    if source.settings.depth_along == "ray":
-        seen_by = source.camera if source.T_color_depth is None else source.depth_camera.camera
-        along_z = values / seen_by.ray_lengths()
-        values = along_z if values.dtype.kind == "f" else np.rint(along_z).astype(values.dtype)
-    if source.keeps_depth and values.dtype == np.uint16:
-        return Picture(data, color_format, np.asarray(values, dtype=np.uint16)), 0
-    meters = in_meters(values, source.settings.depth_scale, float_unit)
-    if source.T_color_depth is not None:
-        meters = register_depth(meters, source.depth_camera.camera, source.T_color_depth, source.camera)
-    units = np.rint(meters / source.depth_scale)
-    raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
-    return Picture(data, color_format, raw), int((units > FARTHEST).sum())
-
-
-def _check_size(where: str, found: tuple[int, int], camera: PinholeCamera) -> None:
-    if found != (camera.width, camera.height):
-        raise DuagError(
-            f"{where} is {found[0]}x{found[1]}, expected {camera.width}x{camera.height} as in its CameraInfo"
-        )
+        return self.empty / max(1, with_depth * source.camera.width * source.camera.height)
 
 
 def _truth_lag(source: RobotLog) -> dict[str, float]:
