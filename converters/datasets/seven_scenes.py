@@ -36,6 +36,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.lens import Lens
 from duagc.pipeline.kernels.drawn_depth import displaced_depth
 from duagc.pipeline.messages.parts import NANOSECONDS
+from duagc.pipeline.recording.greatest_depth import units_of_depth
 
 Depth = Array
 Reference = dict[int, Array]  # T_world_color [4, 4] by frame number
@@ -312,7 +313,7 @@ def _write_robot(
         T_world_camera = _true_pose(files, reference, options)
         check.add(index, depth, T_world_camera)
         stamp_ns = (files.number - frames[0].number) * NANOSECONDS // options.rate_hz
-        raw = np.rint(depth / DEPTH_SCALE).astype(np.uint16)
+        raw, _ = units_of_depth(depth, DEPTH_SCALE)
         robot.add_frame(stamp_ns, color, color_format, raw, T_world_camera=T_world_camera)
         holes += _count_holes(raw)
         invalid += raw.size - int(np.count_nonzero(raw))

@@ -18,7 +18,7 @@ from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, encode_png
-from duagc.pipeline.recording.greatest_depth import SATURATED
+from duagc.pipeline.recording.greatest_depth import units_of_depth
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.motion import GyroPrior, MotionPrior
 
@@ -164,12 +164,7 @@ class StereoFrames:
         """
         color, other = self.rectified(left, right, where)
         depth_m, sigma_m = self.rig.depth(gray(color), gray(other))
-        units = np.rint(depth_m / STEREO_SCALE_M)
-        return (
-            encode_png(color),
-            np.where(units < SATURATED, units, 0).astype(np.uint16),
-            sigma_m,
-        )
+        return encode_png(color), units_of_depth(depth_m, STEREO_SCALE_M)[0], sigma_m
 
 
 def gray(image: Image) -> Image:

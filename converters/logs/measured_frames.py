@@ -21,7 +21,7 @@ from duagc.converters.logs.unmeasured import first_depths, float_unit_m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.recording.greatest_depth import SATURATED, unmeasured
+from duagc.pipeline.recording.greatest_depth import SATURATED, units_of_depth, unmeasured
 from duagc.pipeline.recording.register_depth import register_depth
 
 FARTHEST = SATURATED - 1  # in units of depth
@@ -110,9 +110,8 @@ def measured(
     meters = in_meters(values, source.settings.depth_scale, float_unit)
     if source.T_color_depth is not None:
         meters = register_depth(meters, source.depth_camera.camera, source.T_color_depth, source.camera)
-    units = np.rint(meters / source.depth_scale)
-    raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
-    return Picture(data, color_format, raw), int((units > FARTHEST).sum())
+    raw, beyond = units_of_depth(meters, source.depth_scale)
+    return Picture(data, color_format, raw), beyond
 
 
 def _check_size(where: str, found: tuple[int, int], camera: PinholeCamera) -> None:

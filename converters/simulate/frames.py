@@ -32,6 +32,7 @@ from duagc.pipeline.base import determinism, random_streams
 from duagc.pipeline.base.files import encode_png, new_file
 from duagc.pipeline.base.workers import start_now, worker_pool
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.greatest_depth import units_of_depth
 
 
 @dataclass(frozen=True)
@@ -265,8 +266,7 @@ class _Undistortion:
 
 def _units(depth_m: NDArray[np.float64], scale_m: float) -> NDArray[np.uint16]:
     """Depth in units of scale_m; what does not fit is no measurement."""
-    units = np.rint(depth_m / scale_m)
-    return np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
+    return units_of_depth(depth_m, scale_m)[0]
 
 
 class RenderPool:

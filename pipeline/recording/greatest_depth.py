@@ -31,6 +31,20 @@ def without_saturated(image: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return np.where(image == SATURATED, np.uint16(0), image)
 
 
+def units_of_depth(depth_m: NDArray[np.floating], unit_m: float) -> tuple[NDArray[np.uint16], int]:
+    """A depth image as a recording holds it.
+
+    Args:
+        depth_m: [h, w], meters, 0 = unknown.
+        unit_m: meters per unit.
+
+    Returns:
+        [h, w] in units, 0 also where it is farther than 16 bits can say, and how many pixels that are.
+    """
+    units = np.rint(depth_m / unit_m)
+    return np.where(units < SATURATED, units, 0).astype(np.uint16), int(np.count_nonzero(units >= SATURATED))
+
+
 def unmeasured(images: Sequence[NDArray[Any]]) -> tuple[float, float]:
     """The distance that a sensor gives where it measures nothing, and its share of the depth; zeros: it gives none.
 

@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -19,6 +20,7 @@ from tests.fixtures.seven_scenes import (
     T_DEPTH_COLOR,
     depth_pose,
     make_rig_sequence,
+    make_sequence,
     poses_of,
     render,
 )
@@ -150,6 +152,24 @@ def test_lens_rotation_and_depth_error_are_undone(tmp_path: Path) -> None:
     colors, depths = errors_of(tmp_path / "as_if_ideal", camera)
     assert colors > 0.1
     assert depths > 0.005
+
+
+def test_depth_that_a_correction_puts_beyond_16_bits_is_none(tmp_path: Path) -> None:
+    """30 m become 75 m, which would be 9.5 m without the highest bit."""
+    source = make_sequence(tmp_path / "seq-01", frames=2)
+    for path in source.glob("*.depth.png"):
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        raw[200:240, 200:240] = 30_000
+        cv2.imwrite(str(path), raw)
+    options = {f"depth_correction_per_m={sign}0.02 0 0 0 0 0" for sign in ("", "-")}
+    found = []
+    for k, option in enumerate(sorted(options)):
+        registry.convert("7scenes", source, tmp_path / f"rec{k}", options=[option])
+        with open_rgbd(tmp_path / f"rec{k}" / "alpha.mcap") as log:
+            found.append(log.frame(0).depth[210:230, 210:230])
+    nearer, farther = sorted(found, key=np.median, reverse=True)
+    assert 10 < np.median(nearer) < 30
+    assert not farther.any()
 
 
 # --- the table of converters ------------------------------------------------------------------------------------------
