@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.files import encode_png, new_file
+from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
 
 Image = NDArray[np.uint8]
 
@@ -45,7 +46,7 @@ class Preview:
             kept: indices of the frames of each that are recorded.
         """
         self.title, self.names, self.trajectories, self.walks = title, names, trajectories, walks
-        spread = [np.unique(np.linspace(0, len(k) - 1, THUMBS).round().astype(np.int64)) for k in kept]
+        spread = [evenly_spaced_to_ends(len(k), THUMBS) for k in kept]
         self.shown = {name: np.array(k)[s].tolist() for name, k, s in zip(names, kept, spread, strict=True)}
         self._thumbs: dict[tuple[str, int], Image] = {}
 

@@ -16,6 +16,7 @@ from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import distance_px
+from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
 from duagc.pipeline.recording import RgbdLog, open_rgbd
 from duagc.pipeline.recording.rolling_shutter import Readout, share_of_readout
 from duagc.pipeline.registration.definition import SAME_SURFACE
@@ -104,7 +105,7 @@ def load_views(tracked: Tracked, first: int, last: int, most: int, *, without: C
     name = f"{tracked.robot}, frames {first} to {last - 1}"
     good = first + np.flatnonzero((tracked.ok & ~tracked.held_out)[first:last])
     good = good[~np.isin(good, list(without))]
-    chosen = good[np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(int))]
+    chosen = good[evenly_spaced_to_ends(len(good), most)]
     images = []
     with open_rgbd(tracked.path) as log:
         camera = log.camera

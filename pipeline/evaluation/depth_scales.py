@@ -21,7 +21,7 @@ from duagc.pipeline.base.component_names import robot_of, same_robot
 from duagc.pipeline.evaluation.feature_agreement import FEATURES, MatchedPair, match_views
 from duagc.pipeline.evaluation.network import is_inlier
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.geometry.statistics import mad_sigma
+from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends, mad_sigma
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.registration.features import Features, extract
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
@@ -77,8 +77,8 @@ def depth_scales(run: RunFolder, source: Recording, decisions: Iterable[Any]) ->
 
         for robot, all_ends in sorted(keyframes.items()):
             first = run.robots[robot].component[0]
-            spread = np.linspace(0, len(all_ends) - 1, min(len(all_ends), MOST_CLOSURES))
-            ends = [sorted(all_ends)[k] for k in spread.round().astype(int)]
+            in_order = sorted(all_ends)
+            ends = [in_order[k] for k in evenly_spaced_to_ends(len(in_order), MOST_CLOSURES)]
             pairs = [match_views(features(first, a), features(robot, b), a, b) for a, b in ends]
             ratios = [_log_ratio(pair) for pair in pairs if pair is not None]
             if len(ratios) >= FEWEST_CLOSURES:

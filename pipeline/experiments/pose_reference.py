@@ -27,6 +27,7 @@ from duagc.pipeline.evaluation.trajectory_errors import Paired
 from duagc.pipeline.frontend import bundle
 from duagc.pipeline.frontend.frame_images import pyramid_of
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
 from duagc.pipeline.registration import Level, Reference, RgbdPyramid
@@ -223,7 +224,7 @@ def _agreement(
     chosen = []
     for robot in robots:
         rows = np.flatnonzero(robot.held_out)
-        few = rows[np.unique(np.linspace(0, len(rows) - 1, min(VIEWS, len(rows))).round().astype(np.int64))]
+        few = rows[evenly_spaced_to_ends(len(rows), VIEWS)]
         chosen += [(robot, int(row)) for row in few]
     depths = [robot.log.usable_depth(int(robot.frame_index[row])) for robot, row in chosen]
     T = {name: np.array([p[r.run.robot][row] for r, row in chosen]) for name, p in answers.items()}

@@ -70,3 +70,13 @@ def evenly_spaced(total: int, count: int) -> list[int]:
         count: number of things chosen.
     """
     return [(2 * k + 1) * total // (2 * count) for k in range(count)]
+
+
+def evenly_spaced_to_ends(total: int, most: int) -> NDArray[np.int64]:
+    """At most so many of 0 .. total - 1, ascending, the first and the last among them.
+
+    Args:
+        total: number of things to choose from.
+        most: number of things chosen, if there are so many; two or more.
+    """
+    return np.unique(np.linspace(0, total - 1, min(total, most)).round().astype(np.int64))

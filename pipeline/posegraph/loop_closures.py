@@ -16,6 +16,7 @@ from scipy.spatial.distance import cdist
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
 CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
@@ -266,7 +267,7 @@ def robust_frame(frames: Array, config: LoopClosureConfig) -> Array:
         frames: [m, 4, 4], m > 0, meters.
         config: scales of the Cauchy weights.
     """
-    tried = np.unique(np.linspace(0, len(frames) - 1, _CANDIDATES).round().astype(np.int64))
+    tried = evenly_spaced_to_ends(len(frames), _CANDIDATES)
     support = [float(_cauchy(frames, frames[k], config).sum()) for k in tried]
     T = frames[tried[int(np.argmax(support))]]
     for _ in range(20):

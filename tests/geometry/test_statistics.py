@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from duagc.pipeline.geometry.statistics import (
     evenly_spaced,
+    evenly_spaced_to_ends,
     huber_divisor,
     mad_sigma,
     mad_sigmas,
@@ -50,5 +51,16 @@ def test_even_samples_are_distinct_and_symmetric_parts(total: int, share: float)
     assert len(gaps) == 0 or gaps.max() - gaps.min() <= 1
 
 
+@given(total=st.integers(2, 1000), most=st.integers(2, 1100))
+def test_even_samples_to_the_ends_are_distinct_and_have_both(total: int, most: int) -> None:
+    chosen = evenly_spaced_to_ends(total, most).tolist()
+    assert len(set(chosen)) == len(chosen) == min(total, most)
+    assert (chosen[0], chosen[-1]) == (0, total - 1)
+    gaps = np.diff(chosen)
+    assert gaps.max() - gaps.min() <= 1
+
+
 def test_no_samples_of_nothing() -> None:
     assert evenly_spaced(0, 0) == []
+    assert evenly_spaced_to_ends(0, 5).tolist() == []
+    assert evenly_spaced_to_ends(1, 5).tolist() == [0]

@@ -9,6 +9,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
 from duagc.pipeline.recording.shutter import LONGEST_S
 
 MOMENT_S = 0.005  # over which the speed of a pixel is measured
@@ -60,7 +61,7 @@ def exposure_for(
     """
     speeds = []
     for path, twist in zip(paths, twists, strict=True):
-        for i in np.unique(np.linspace(0, len(path) - 1, FRAMES).round().astype(int)):
+        for i in evenly_spaced_to_ends(len(path), FRAMES):
             speeds.append(pixel_speed_px_s(renderer, path[i], twist[i], camera))
     speed = float(np.median(speeds))
     if speed < 1e-3:

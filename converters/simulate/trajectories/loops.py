@@ -18,6 +18,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import visible
+from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
 
 STEP_M = 0.022
 MIN_CLEARANCE_M = 0.5
@@ -182,7 +183,7 @@ def look(renderer: CameraRenderer, path: Array) -> PathViews:
         renderer: of the views.
         path: T_world_camera [frames, 4, 4].
     """
-    poses = path[np.unique(np.linspace(0, len(path) - 1, OVERLAP_VIEWS).round().astype(np.int64))]
+    poses = path[evenly_spaced_to_ends(len(path), OVERLAP_VIEWS)]
     depths = np.stack([renderer.depth(T)[0] for T in poses])
     rays = renderer.camera.rays()
     points = [

@@ -29,6 +29,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
 
 if TYPE_CHECKING:
     from scipy.sparse import coo_array
@@ -385,4 +386,4 @@ def most_shown(renderer: CameraRenderer, teams: list[list[Array]]) -> list[Array
 
 def _some_views(poses: Array) -> Array:
     """Poses [n, 4, 4] evenly spread over a walk."""
-    return poses[np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64))]
+    return poses[evenly_spaced_to_ends(len(poses), VIEWS)]
