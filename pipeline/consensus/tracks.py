@@ -11,6 +11,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.disjoint_sets import root_of
 from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
 from duagc.pipeline.consensus.matching import Index, Pairs, gaussian_distance
@@ -109,16 +110,9 @@ def _of_sound_components(i: Index, j: Index, d: Array, owner: Index) -> NDArray[
     parent = list(range(len(nodes)))
     # robots of the component of a root, by bits; 0: one of them is there twice
     robots = [1 << int(k) for k in owner[nodes]]
-
-    def root(node: int) -> int:
-        while parent[node] != node:
-            parent[node] = parent[parent[node]]
-            node = parent[node]
-        return node
-
     keep = np.zeros(len(i), dtype=bool)
     for k in np.lexsort((j, i, -d))[::-1].tolist():
-        first, second = root(ends[k][0]), root(ends[k][1])
+        first, second = (root_of(parent, end) for end in ends[k])
         if first != second:
             a, b = robots[first], robots[second]
             parent[second] = first

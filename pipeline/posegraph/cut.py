@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.disjoint_sets import root_of
 from duagc.pipeline.base.errors import DuagError
 
 Index = NDArray[np.int64]
@@ -27,20 +28,13 @@ def spanning_forest(count: int, edges: Sequence[tuple[int, int]]) -> tuple[list[
         Positions of the used edges; int64 [count], the lowest node of each node's tree.
     """
     group = list(range(count))
-
-    def root(k: int) -> int:
-        while group[k] != k:
-            group[k] = group[group[k]]
-            k = group[k]
-        return k
-
     used = []
     for position, (i, j) in enumerate(edges):
-        a, b = root(i), root(j)
+        a, b = root_of(group, i), root_of(group, j)
         if a != b:
             group[max(a, b)] = min(a, b)
             used.append(position)
-    return used, np.array([root(k) for k in range(count)], dtype=np.int64)
+    return used, np.array([root_of(group, k) for k in range(count)], dtype=np.int64)
 
 
 def owners(count: int, edges: Sequence[tuple[int, int]], robots: int, path: object) -> list[int]:
