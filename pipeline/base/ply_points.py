@@ -30,12 +30,13 @@ def read_points(path: Path) -> NDArray[np.void]:
         raise DuagError(f"{path}: not a binary little-endian .ply, expected points with normals")
     elements = [words[1:] for words in lines if words[0] == "element"]
     properties = [words[1:] for words in lines if words[0] == "property"]
-    if len(elements) != 1 or elements[0][0] != "vertex" or not elements[0][-1].isdigit():
+    if [words[:1] for words in elements] != [["vertex"]] or not elements[0][-1].isdecimal():
         raise DuagError(f"{path}: has elements {elements}, expected only 'vertex N'")
-    missing = {"x", "y", "z", "nx", "ny", "nz"} - {words[-1] for words in properties}
-    if missing or any(words[0] not in _TYPES for words in properties):
+    names = [words[1] for words in properties if len(words) == 2 and words[0] in _TYPES]
+    missing = {"x", "y", "z", "nx", "ny", "nz"} - set(names)
+    if missing or len(set(names)) < len(properties):
         raise DuagError(f"{path}: has properties {properties}, expected scalars with x, y, z, nx, ny, nz")
-    row = np.dtype([(words[-1], _TYPES[words[0]]) for words in properties])
+    row = np.dtype([(name, _TYPES[kind]) for kind, name in properties])
     expected = int(elements[0][-1]) * row.itemsize
     if len(body) != expected:
         raise DuagError(f"{path}: {len(body)} bytes of vertices, expected {expected}")

@@ -227,10 +227,8 @@ def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
     assert log.channels["/alpha/camera/depth"].metadata["depth_scale"] == "0.00025"
     expected = np.where(pixels == 65535, 0, pixels)
     assert (pixels == 65535).any()
-    assert all(
-        np.array_equal(m.unpack_depth(record.proto(), "here"), expected[i])
-        for i, record in enumerate(records)
-    )
+    found = [m.unpack_depth(record.proto(), "here") for record in records]
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_depth_registered_to_color_without_distortion_has_the_camera_of_that(tmp_path: Path) -> None:
