@@ -7,15 +7,13 @@ Everything is written into a temporary folder next to the output, which gets its
 
 from __future__ import annotations
 
-import multiprocessing
-import threading
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.stop_signals import start_resource_tracker
+from duagc.pipeline.base.worker_reports import listening
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.base import check_numbers
 from duagc.pipeline.config.packages import check_packages
@@ -105,21 +103,8 @@ def _run(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, l
 
 def _run_in_child(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> None:
     """`_run` in a process that is started with the settings of `determinism`; its lines come back to `log`."""
-    start_resource_tracker()
-    lines: SimpleQueue[str | None] = multiprocessing.get_context("spawn").SimpleQueue()
-
-    def relay() -> None:
-        while (line := lines.get()) is not None:
-            log(line)
-
-    relaying = threading.Thread(target=relay)
-    relaying.start()
-    try:
-        with worker_pool(1, _keep_queue, (lines,)) as pool:
-            pool.submit(_run_and_send, recording_path, out, config, plan).result()
-    finally:
-        lines.put(None)
-        relaying.join()
+    with listening(log) as lines, worker_pool(1, _keep_queue, (lines,)) as pool:
+        pool.submit(_run_and_send, recording_path, out, config, plan).result()
 
 
 _lines: list[SimpleQueue[str | None]] = []

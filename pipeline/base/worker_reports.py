@@ -7,9 +7,11 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.queues import SimpleQueue
+from typing import TypeVar
 
 from duagc.pipeline.base.stop_signals import start_resource_tracker
 
+Item = TypeVar("Item")
 Step = tuple[str, str, int, int]
 """Of a robot: its name, what is done of it, steps done, steps in all; 0 of 0: it is done."""
 OF_TEAM = ""
@@ -41,18 +43,26 @@ def tell(step: Step) -> None:
 
 
 @contextmanager
-def listening(hear: Hear) -> Iterator[SimpleQueue[Step | None]]:
+def listening(hear: Callable[[Item], None]) -> Iterator[SimpleQueue[Item | None]]:
     """A queue for worker processes; what they tell is heard in a thread while the block runs.
 
+    An error of `hear` is raised at the end of the block. Until then what comes is dropped: no process waits at a full
+    queue.
+
     Args:
-        hear: gets every step.
+        hear: gets everything.
     """
     start_resource_tracker()
-    queue: SimpleQueue[Step | None] = multiprocessing.get_context("spawn").SimpleQueue()
+    queue: SimpleQueue[Item | None] = multiprocessing.get_context("spawn").SimpleQueue()
+    failed: list[Exception] = []
 
     def relay() -> None:
-        while (step := queue.get()) is not None:
-            hear(step)
+        while (item := queue.get()) is not None:
+            if not failed:
+                try:
+                    hear(item)
+                except Exception as error:
+                    failed.append(error)
 
     relaying = threading.Thread(target=relay, daemon=True)
     relaying.start()
@@ -61,3 +71,5 @@ def listening(hear: Hear) -> Iterator[SimpleQueue[Step | None]]:
     finally:
         queue.put(None)
         relaying.join(timeout=5.0)
+    if failed:
+        raise failed[0]

@@ -133,6 +133,18 @@ def test_what_a_worker_said_and_reported_is_not_lost_at_its_end(capfd: pytest.Ca
     assert capfd.readouterr().out == "said by a worker"
 
 
+def test_an_error_of_who_listens_is_raised_and_keeps_no_worker_waiting() -> None:
+    def fail(step: worker_reports.Step) -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    with (
+        pytest.raises(BrokenPipeError),
+        worker_reports.listening(fail) as queue,
+        worker_pool(1, worker_reports.keep_queue, (queue,)) as pool,
+    ):
+        pool.submit(say_and_report, 500).result(timeout=60)  # more than a pipe holds
+
+
 def test_what_can_wait_leaves_the_processors_to_others() -> None:
     found: list[int] = []
     when_idle(lambda: found.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
