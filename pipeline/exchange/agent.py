@@ -127,12 +127,11 @@ class Agent:
 
     # --- one round
 
-    def tick(self, round_index: int, now_ns: int, delivered: Sequence[bytes]) -> list[Outgoing]:
+    def tick(self, round_index: int, delivered: Sequence[bytes]) -> list[Outgoing]:
         """Handle what was delivered, compute, and send at most one burst to each neighbor.
 
         Args:
             round_index: counts from 0.
-            now_ns: time of this round.
             delivered: packets, in order of arrival.
         """
         self.round = round_index

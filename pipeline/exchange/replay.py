@@ -76,7 +76,6 @@ def replay_agent_of(
     neighbors = link_model.neighbors(config.link, session.team)[data.robot]
     agent = MapAgent(data, session.team, neighbors, config, seed=seed)
     for round_index in range(session.rounds):
-        now_ns = round_index * config.period_ns
-        for out in agent.tick(round_index, now_ns, due(waiting, now_ns)):
+        for out in agent.tick(round_index, due(waiting, round_index * config.period_ns)):
             recomputed.update(out.packet)
     return result_of(agent), SentPackets(recorded.hexdigest(), recomputed.hexdigest())

@@ -74,8 +74,7 @@ def run_rounds(
         now_ns = round_index * period_ns
         bursts = []
         for robot, agent in agents.items():
-            delivered = due(waiting[robot], now_ns)
-            bursts.append((robot, agent.tick(round_index, now_ns, delivered)))
+            bursts.append((robot, agent.tick(round_index, due(waiting[robot], now_ns))))
             observer.ticked(agent, round_index, now_ns)
         for sender, burst in bursts:
             for out in burst:

@@ -217,7 +217,7 @@ def test_a_neighbor_that_falls_silent_ends_the_session(team: Team) -> None:
             assert agents["alpha"].poses is not None
             assert not agents["alpha"].agreed
             del agents["bravo"]
-        sent = {n: agent.tick(round_index, round_index, air[n]) for n, agent in agents.items()}
+        sent = {n: agent.tick(round_index, air[n]) for n, agent in agents.items()}
         air = {n: [o.packet for s in sent.values() for o in s if o.receiver == n] for n in NAMES[:2]}
     assert agents["alpha"].done
     result = result_of(agents["alpha"])
@@ -252,7 +252,7 @@ def test_hostile_packets_change_nothing(team: Team) -> None:
             serialize(dataclasses.replace(r, sequence=next(sequences))) if isinstance(r, Packet) else r
             for r in rubbish
         ]
-        for out in agent.tick(round_index, round_index, packets):
+        for out in agent.tick(round_index, packets):
             assert parse(out.packet).sender == 0
     assert sum(agent.refused.values()) > 200
     assert not agent.neighbors[1].decided

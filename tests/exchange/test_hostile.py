@@ -54,7 +54,7 @@ def meet(
     heard: list[bytes] = []
     invented = 0
     for round_index in range(600):
-        sent = {name: agent.tick(round_index, round_index, air[name]) for name, agent in agents.items()}
+        sent = {name: agent.tick(round_index, air[name]) for name, agent in agents.items()}
         air = {name: [o.packet for s in sent.values() for o in s if o.receiver == name] for name in agents}
         heard += [o.packet for s in sent.values() for o in s]
         for name in agents if tampers else ():
@@ -208,9 +208,7 @@ def test_a_part_of_evidence_is_refused_as_it_arrives(
     body["id"] = np.arange(len(body))
     body["theta"][1] = color
     evidence = evidence_wire.write_evidence(kind, owner, "blended", body)
-    bravo.tick(
-        0, 0, [serialize(Packet(kind, 0, 1, 0, 0, 9, 0, len(evidence), evidence[: chunk_bytes(kind)]))]
-    )
+    bravo.tick(0, [serialize(Packet(kind, 0, 1, 0, 0, 9, 0, len(evidence), evidence[: chunk_bytes(kind)]))])
     taken = reason is None
     assert bravo.refused == ({} if taken else {reason: 1})
     assert len(bravo.sharing.knowledge.incoming) == taken

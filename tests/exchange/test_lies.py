@@ -44,7 +44,7 @@ def session(
     air: dict[str, list[bytes]] = {name: [] for name in agents}
     held: list[tuple[str, bytes]] = []
     for k in range(rounds):
-        sent = {name: agent.tick(k, k, air[name]) for name, agent in agents.items()}
+        sent = {name: agent.tick(k, air[name]) for name, agent in agents.items()}
         for agent in agents.values():
             if agent.poses is not None:
                 agent.poses.residuals()  # as the record of a session asks for them

@@ -29,8 +29,7 @@ def live(pipe: Connection, place: int) -> None:
     data, _ = robot(NAMES[place], 0.6 * place, keyframes=4)
     agent = MapAgent(data, NAMES, link_model.neighbors(CONFIG.link, NAMES)[NAMES[place]], CONFIG, seed=0)
     while (heard := pipe.recv()) is not None:
-        round_index, now_ns, packets = heard
-        sent = [(out.receiver, out.packet) for out in agent.tick(round_index, now_ns, packets)]
+        sent = [(out.receiver, out.packet) for out in agent.tick(*heard)]
         pipe.send((sent, agent.done))
     pipe.send(result_of(agent))
     pipe.close()
@@ -43,7 +42,7 @@ def carry(pipes: dict[str, Connection]) -> None:
     for round_index in range(CONFIG.max_rounds):
         now_ns = round_index * CONFIG.period_ns
         for name, pipe in pipes.items():
-            pipe.send((round_index, now_ns, due(waiting[name], now_ns)))
+            pipe.send((round_index, due(waiting[name], now_ns)))
         answers = {name: pipe.recv() for name, pipe in pipes.items()}
         for sender, (sent, _) in answers.items():
             for receiver, packet in sent:

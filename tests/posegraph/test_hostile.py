@@ -29,7 +29,7 @@ def test_changed_payloads_crash_nobody(tmp_path, solver, robust):
         agents = {n: PoseGraphAgent(team.robots[n], sorted(team.robots), config) for n in team.robots}
         waiting = {name: [] for name in agents}
         for k in range(40):
-            sent = [out for name, agent in agents.items() for out in agent.tick(k, k, waiting[name])]
+            sent = [out for name, agent in agents.items() for out in agent.tick(k, waiting[name])]
             waiting = {name: [] for name in agents}
             for out in sent:
                 packet = parse(out.packet)
@@ -52,7 +52,7 @@ def test_changed_payloads_crash_nobody(tmp_path, solver, robust):
 def ticks(agents, waiting, rounds):
     """Carry every packet through rounds, by index."""
     for k in rounds:
-        sent = [out for name, agent in agents.items() for out in agent.tick(k, k, waiting[name])]
+        sent = [out for name, agent in agents.items() for out in agent.tick(k, waiting[name])]
         waiting.update({name: [o.packet for o in sent if o.receiver == name] for name in agents})
 
 

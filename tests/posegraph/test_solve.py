@@ -113,7 +113,7 @@ def test_bytes_are_those_of_real_packets_with_their_headers(helix_file, solver):
     agents = {name: PoseGraphAgent(team.robots[name], sorted(team.robots), config) for name in team.robots}
     waiting, size, count = {name: [] for name in agents}, 0, 0
     for k in range(40):
-        sent = [out for name, agent in agents.items() for out in agent.tick(k, k, waiting[name])]
+        sent = [out for name, agent in agents.items() for out in agent.tick(k, waiting[name])]
         waiting = {name: [] for name in agents}
         for out in sent:
             assert len(out.packet) <= MAX_PACKET_BYTES
