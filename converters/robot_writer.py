@@ -20,6 +20,7 @@ from duagc.converters.layouts.sigma_units import SIGMA_SCALE_M, sigma_units
 from duagc.converters.layouts.sound_camera import check_camera
 from duagc.converters.layouts.sound_frame import check_color, check_pose, check_sigma, check_stamp
 from duagc.converters.layouts.validity import mask_of_user
+from duagc.converters.truth_writer import TruthWriter
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -69,8 +70,8 @@ class RobotWriter:
         self.summary: dict[str, Any] = {}
         self._files = ExitStack()
         self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
-        self._truth: LogWriter | None = None
-        self._has_depth = self._has_exact_depth = self._has_sigma = False
+        self._truth = TruthWriter(self.folder, name, self.depth_scale, self._files)
+        self._has_depth = self._has_sigma = False
         self._valid = mask_of_user(name, camera.width, camera.height)
         self._regions = FoundRegions() if find_regions else None
         self._lens: Lens | None = None
@@ -80,7 +81,6 @@ class RobotWriter:
         # topic of a sensor's pose in the camera that is still to be written
         self._sensors: dict[str, NDArray[np.float64]] = {}
         self._stamps: list[int] = []
-        self._positions: list[NDArray[np.float64]] = []
 
     def __enter__(self) -> RobotWriter:
         self._files.enter_context(self._log)
@@ -168,7 +168,7 @@ class RobotWriter:
                 increase, or a standard deviation is negative or not finite.
             DuagError: the true pose is no rigid motion, or 1e9 m away.
         """
-        for image in (depth, mask, true_mask, depth_sigma_m):
+        for image in (depth, mask, true_mask, depth_sigma_m, exact_depth):
             if image is not None:
                 self._check_size(image)
         name, where = self.name, f"robot {self.name}: frame at {stamp_ns} ns"
@@ -199,13 +199,7 @@ class RobotWriter:
             self._add_registered_depth(stamp_ns, taken_ns, depth, depth_sigma_m)
         if mask is not None:
             self._log.write(topics.MASK.of(name), messages.pack_mask(stamp_ns, name, mask), stamp_ns)
-        if true_mask is not None:
-            truth_topic = topics.GROUNDTRUTH_MASK.of(name)
-            self._truth_log().write(truth_topic, messages.pack_mask(stamp_ns, name, true_mask), stamp_ns)
-        if T_world_camera is not None:
-            self._add_true_pose(stamp_ns, T_world_camera)
-        if exact_depth is not None:
-            self._add_exact_depth(stamp_ns, exact_depth)
+        self._truth.add(stamp_ns, T_world_camera, exact_depth, true_mask)
 
     def _add_registered_depth(
         self,
@@ -222,19 +216,6 @@ class RobotWriter:
         self._log.write(topic, messages.pack_depth(taken_ns, self.name, depth), stamp_ns, taken_ns)
         if sigma_m is not None:
             self._add_sigma(stamp_ns, taken_ns, depth, sigma_m)
-
-    def _add_true_pose(self, stamp_ns: int, T_world_camera: NDArray[np.float64]) -> None:
-        pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
-        self._truth_log().write(topics.GROUNDTRUTH_POSE.of(self.name), pose, stamp_ns)
-        self._positions.append(T_world_camera.astype(np.float64)[:3, 3].copy())
-
-    def _add_exact_depth(self, stamp_ns: int, exact_depth: NDArray[np.uint16]) -> None:
-        self._check_size(exact_depth)
-        truth, topic = self._truth_log(), topics.GROUNDTRUTH_DEPTH.of(self.name)
-        if not self._has_exact_depth:
-            truth.channel(topic, topics.GROUNDTRUTH_DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)})
-            self._has_exact_depth = True
-        truth.write(topic, messages.pack_depth(stamp_ns, self.name, exact_depth), stamp_ns)
 
     def _add_sigma(
         self, stamp_ns: int, taken_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating]
@@ -345,13 +326,6 @@ class RobotWriter:
         if image.shape != (self.camera.height, self.camera.width):
             raise ValueError(f"an image is {image.shape}, expected {(self.camera.height, self.camera.width)}")
 
-    def _truth_log(self) -> LogWriter:
-        """The ground-truth log, opened when there is something to say."""
-        if self._truth is None:
-            truth = LogWriter(self.folder / f"{self.name}.groundtruth.mcap", self.name)
-            self._truth = self._files.enter_context(truth)
-        return self._truth
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -372,7 +346,7 @@ class RobotWriter:
         summary: dict[str, Any] = {
             "robot": self.name,
             "log": self._log.path.name,
-            "groundtruth": self._truth.path.name if self._truth else None,
+            "groundtruth": next(iter(self._truth.digests), None),
             "frames": len(self._stamps),
             "start_ns": self._stamps[0],
             "end_ns": self._stamps[-1],
@@ -380,18 +354,11 @@ class RobotWriter:
             "camera": asdict(self.camera),
             "depth_scale_m": self.depth_scale,
             "sensors": self.sensors,
-            "digests": {self._log.path.name: self._log.digest},
-            "path": None,
+            "digests": {self._log.path.name: self._log.digest, **self._truth.digests},
+            "path": self._truth.way,
             "color_digests": sorted(self._colors),
         }
         if self._valid is not None:
             summary["masked_share"] = float(np.mean(~self._valid))
         summary |= {f"{name}_share": share for name, share in self._shares.items()}
-        if self._truth:
-            summary["digests"][self._truth.path.name] = self._truth.digest
-        if self._positions:
-            positions = np.array(self._positions)
-            length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-            low, high = positions.min(axis=0).tolist(), positions.max(axis=0).tolist()
-            summary["path"] = {"length_m": length, "low_m": low, "high_m": high}
         return summary

@@ -122,6 +122,7 @@ def test_bugs_of_converters_are_errors(tmp_path: Path) -> None:
         ),
         ({"depth_sigma_m": np.full(depth(1).shape, np.nan)}, "standard deviation of depth is nan m"),
         ({"depth_sigma_m": np.full(depth(1).shape, np.inf)}, "standard deviation of depth is inf m"),
+        ({"exact_depth": depth(1)[1:]}, rf"an image is .*, expected \({CAMERA.height}, {CAMERA.width}\)"),
     ],
 )
 def test_a_frame_that_is_none_is_refused(tmp_path: Path, wrong: dict[str, Any], complaint: str) -> None:
