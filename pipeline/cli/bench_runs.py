@@ -1,6 +1,7 @@
 """Commands that measure whole runs: for every second of log, as logs get longer, and what they state."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -117,6 +118,7 @@ def bench_information(
     Example: `duagc bench information outputs/redkitchen --out outputs/information`
     """
     from duagc.pipeline.base import determinism
+    from duagc.pipeline.base.atomic_folder import new_folder
     from duagc.pipeline.base.errors import DuagError
     from duagc.pipeline.base.files import new_file
     from duagc.pipeline.experiments import information_structure, information_tables
@@ -131,17 +133,17 @@ def bench_information(
     plan = information_structure.StructurePlan(
         sample, tuple(counts("--windows", windows)), robots=(robot,) if robot else (), seed=seed
     )
-    found = information_structure.run(run, source, plan)
-    code = information_structure.code_digest()
-    text = json.dumps(information_tables.numbers(found, code), indent=2)
-    if out is not None:
-        out.mkdir(parents=True)
-        for name, content in (
-            ("information.json", f"{text}\n"),
-            ("information.md", information_tables.page(found, code)),
-            ("r_k.svg", information_tables.plot(found)),
-        ):
-            with new_file(out / name) as part:
-                part.write_text(content, encoding="utf-8")
-        information_structure.write_gaussians(found.columns, out / "gaussians.parquet")
+    with nullcontext() if out is None else new_folder(out, force=False) as folder:
+        found = information_structure.run(run, source, plan)
+        code = information_structure.code_digest()
+        text = json.dumps(information_tables.numbers(found, code), indent=2)
+        if folder is not None:
+            for name, content in (
+                ("information.json", f"{text}\n"),
+                ("information.md", information_tables.page(found, code)),
+                ("r_k.svg", information_tables.plot(found)),
+            ):
+                with new_file(folder / name) as part:
+                    part.write_text(content, encoding="utf-8")
+            information_structure.write_gaussians(found.columns, folder / "gaussians.parquet")
     print(text if as_json else information_tables.format_tables(found))

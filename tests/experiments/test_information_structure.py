@@ -1,13 +1,16 @@
 """The information of single Gaussians with its cross terms: sums, measures, verdicts."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli import app
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
 from duagc.pipeline.experiments import information_measures as m
@@ -23,6 +26,7 @@ from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.splat.information import unpack_geometry
 from tests.fixtures.fake_run import make
+from tests.fixtures.full_disks import no_file_larger_than
 from tests.fixtures.noisy_wall import CAMERA, NOISE, SENSOR, views_of, wall
 
 ROWS = np.array([5, 40, 111, 222, 333, 444, 599])
@@ -146,3 +150,13 @@ def test_the_information_of_a_runs_gaussians(tmp_path: Path) -> None:
     assert (tmp_path / "gaussians.parquet").stat().st_size > 1000
     with pytest.raises(DuagError, match="has no robot zulu"):
         information_structure.run(run, source, information_structure.StructurePlan(robots=("zulu",)))
+
+
+def test_a_disk_without_room_is_told_and_leaves_no_half_folder(tmp_path: Path) -> None:
+    fake = make(tmp_path / "fake")
+    words = ["bench", "information", str(fake.run), "--recording", str(fake.recording), "--sample", "3"]
+    with no_file_larger_than(20_000):  # room for all but the plot
+        result = CliRunner().invoke(app, [*words, "--windows", "1", "--out", str(tmp_path / "out")])
+    assert isinstance(result.exception, DuagError)
+    assert re.search(r"r_k\.svg: File too large, expected", str(result.exception))
+    assert [path.name for path in tmp_path.iterdir()] == ["fake"]
