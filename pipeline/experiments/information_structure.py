@@ -206,7 +206,7 @@ def strata(sums: BlockSums, gaussians: Gaussians) -> dict[str, Array]:
     """
     views = np.maximum(sums.views, 1)
     return {
-        "opacity": 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))),
+        "opacity": gaussians.opacities(),
         "footprint_px": sums.pixels / views,
         "views": sums.views.astype(np.float64),
         "depth_m": sums.depth_m / views,

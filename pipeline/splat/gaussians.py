@@ -114,6 +114,10 @@ class Gaussians:
         axes = so3.from_quat_wxyz(self.quats_wxyz.astype(np.float64))
         return np.asarray(axes[np.arange(len(self)), :, np.argmin(self.log_scales, axis=1)])
 
+    def opacities(self) -> NDArray[np.float64]:
+        """Peak opacities [n], 0..1."""
+        return np.asarray(1.0 / (1.0 + np.exp(-self.opacity_logits.astype(np.float64))))
+
     def moved(self, T_old_keyframe: ArrayLike, T_new_keyframe: ArrayLike) -> Gaussians:
         """Move every Gaussian with its anchor.
 

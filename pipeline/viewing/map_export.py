@@ -112,8 +112,10 @@ def _export_robot(run: RunFolder, robot: RobotRun, folder: Path, plan: ExportPla
     rows = np.arange(len(gaussians))
     if plan.kind == "points":
         rows = np.flatnonzero(columns["opacity"] >= plan.min_opacity)
+        if not len(gaussians):
+            raise DuagError(f"{robot.folder}: its final map has no Gaussian, expected some for --points")
         if not len(rows):
-            most = columns["opacity"].max(initial=0.0)
+            most = columns["opacity"].max()
             raise DuagError(
                 f"{robot.folder}: the most opaque of {len(gaussians)} Gaussians has {most:.2f}, "
                 f"expected --min-opacity below {plan.min_opacity:g}"
@@ -153,13 +155,12 @@ def _points(run: RunFolder, robot: RobotRun, shown: GaussianMap) -> dict[str, ND
     """What a point cloud says of each Gaussian besides place and color: `normals`, `sigma_m`, `opacity`."""
     gaussians = shown.gaussians
     cameras = [run.robots[name].trajectory.positions for name in robot.component if name in run.robots]
-    opacity = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     sigma_m = stated_in_world(robot, shown).sigma_m
     sigma_m = np.where(np.isfinite(sigma_m), sigma_m, np.nan)  # nothing is stated of these
     return {
         "normals": _toward(gaussians.normals(), gaussians.means, np.concatenate(cameras)).astype(np.float32),
         "sigma_m": sigma_m.astype(np.float32),
-        "opacity": opacity.astype(np.float32),
+        "opacity": gaussians.opacities().astype(np.float32),
     }
 
 

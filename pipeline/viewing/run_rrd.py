@@ -122,8 +122,7 @@ def thinned(gaussians: Gaussians, most: int) -> NDArray[np.int64]:
     if len(gaussians) <= most:
         return np.arange(len(gaussians))
     scales = np.sort(gaussians.log_scales.astype(np.float64), axis=1)
-    opacity = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    cover = np.log(np.maximum(opacity, 1e-12)) + scales[:, 1] + scales[:, 2]
+    cover = np.log(np.maximum(gaussians.opacities(), 1e-12)) + scales[:, 1] + scales[:, 2]
     return np.sort(np.argsort(-cover, kind="stable")[:most])
 
 
@@ -165,8 +164,7 @@ def splats(gaussians: Gaussians, colors: NDArray[np.float32]) -> Any:
     """
     import rerun as rr
 
-    opacity = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    rgba = np.concatenate([np.clip(colors, 0.0, 1.0), opacity[:, None]], axis=1)
+    rgba = np.concatenate([np.clip(colors, 0.0, 1.0), gaussians.opacities()[:, None]], axis=1)
     quats = gaussians.quats_wxyz / np.linalg.norm(gaussians.quats_wxyz, axis=1, keepdims=True)
     return rr.GaussianSplats3D(
         gaussians.means,

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from duagc.pipeline.base.open3d_import import import_open3d
 from duagc.pipeline.cli import app
 from duagc.pipeline.evaluation.pixel_deviation import StatedMap
 from duagc.pipeline.runs.folder import RobotRun, RunFolder, position_information
+from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import sigma_along
 from duagc.pipeline.splat.ply import read_ply
 from duagc.pipeline.viewing import map_export
@@ -121,6 +123,17 @@ def test_faint_gaussians_are_no_points(fake, tmp_path):
     assert cloud["opacity"].numpy().min() >= most - 1e-6
     with pytest.raises(DuagError, match=r"the most opaque of \d+ Gaussians has 0\.\d+, expected"):
         export(fake.run, tmp_path / "none", ExportPlan("points", min_opacity=(1.0 + most) / 2))
+
+
+def test_a_map_without_a_gaussian_is_no_point_cloud(fake, tmp_path, monkeypatch):
+    """As by `frontend.mapping_enabled=false`: no opacity helps."""
+    found = RunFolder(fake.run).robots["alpha"].fused_map
+    monkeypatch.setattr(RobotRun, "refined_map", None)
+    monkeypatch.setattr(RobotRun, "fused_map", replace(found, gaussians=Gaussians.empty(), information=None))
+    with pytest.raises(DuagError, match=r"alpha: its final map has no Gaussian, expected some for --points"):
+        export(fake.run, tmp_path / "out", ExportPlan("points", min_opacity=0.0))
+    export(fake.run, tmp_path / "out", ExportPlan())
+    assert len(read_ply(tmp_path / "out" / "alpha.ply")) == 0
 
 
 @pytest.mark.parametrize("tile_m", [0.0, -1.0, 0.01, float("nan"), float("inf")])
