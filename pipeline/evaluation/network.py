@@ -27,6 +27,7 @@ from duagc.pipeline.evaluation.oracle import (
 )
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.exchange.record import RUNNING_KINDS
+from duagc.pipeline.messages.parts import unpack_stamp
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.recording import Record, read_log
 from duagc.pipeline.runs.folder import RunFolder
@@ -77,7 +78,8 @@ class Packets:
         receiver: names.
         kind: of its message, names.
         size_bytes: header and payload.
-        arrived: how often it arrived; 0 if it was lost.
+        lost: whether it was dropped on its way.
+        arrived: how often it arrived until the last round.
         messages: how many these packets are cut from.
     """
 
@@ -86,16 +88,12 @@ class Packets:
     receiver: NDArray[np.str_]
     kind: NDArray[np.str_]
     size_bytes: NDArray[np.int64]
+    lost: NDArray[np.bool_]
     arrived: NDArray[np.int64]
     messages: int
 
     def __len__(self) -> int:
         return len(self.round)
-
-    @property
-    def lost(self) -> NDArray[np.bool_]:
-        """Which ones never arrived."""
-        return self.arrived == 0
 
     @cached_property
     def purpose(self) -> NDArray[np.str_]:
@@ -199,16 +197,18 @@ class Session:
                     f"expected one of {', '.join(PURPOSE)}"
                 )
             used.add((p.robot, p.message))
-            arrived = 1 + len(p.copies_deliver_ns) if p.delivered else 0
-            rows.append((p.round, p.robot, p.receiver, kind, _size(p), arrived))
-        columns = list(zip(*rows, strict=True)) or [()] * 6
+            times_ns = (p.deliver_ns, *p.copies_deliver_ns) if p.delivered else ()
+            rows.append((p.round, p.robot, p.receiver, kind, _size(p), not p.delivered, times_ns))
+        end_ns = unpack_stamp(self.summary) if rows else 0
+        columns = list(zip(*rows, strict=True)) or [()] * 7
         return Packets(
             round=np.array(columns[0], dtype=np.int64),
             sender=np.array(columns[1], dtype=np.str_),
             receiver=np.array(columns[2], dtype=np.str_),
             kind=np.array(columns[3], dtype=np.str_),
             size_bytes=np.array(columns[4], dtype=np.int64),
-            arrived=np.array(columns[5], dtype=np.int64),
+            lost=np.array(columns[5], dtype=np.bool_),
+            arrived=np.array([sum(at <= end_ns for at in times) for times in columns[6]], dtype=np.int64),
             messages=len(used),
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,6 +77,9 @@ class ExchangeRecorder:
         self._on_air: set[tuple[str, int]] = set()  # of these, what a radio carried
         self._by_content: dict[bytes, tuple[str, int]] = {}
         self._totals: dict[tuple[str, str, str], list[int]] = {}  # packets, dropped, bytes, bytes delivered
+        self._on_the_way: list[
+            tuple[int, tuple[str, str, str], int]
+        ] = []  # a heap: arrival (ns), link, bytes
 
     def packet(self, sender: str, out: Outgoing, *, round_index: int, send_ns: int, fate: Fate) -> None:
         """Record one packet, and its message if this is the first packet of it.
@@ -111,11 +115,20 @@ class ExchangeRecorder:
         if same_robot(sender, out.receiver):
             return  # between components of one robot: no radio carries it
         self._on_air.add((sender, out.message.id))
-        totals = self._totals.setdefault((sender, out.receiver, out.message.kind.name), [0, 0, 0, 0])
+        link = sender, out.receiver, out.message.kind.name
+        totals = self._totals.setdefault(link, [0, 0, 0, 0])
         totals[0] += 1
         totals[1] += not fate.delivered
         totals[2] += len(out.packet)
-        totals[3] += len(out.packet) * len(fate.deliver_ns)
+        self._arrive(send_ns)
+        for at_ns in fate.deliver_ns:
+            heapq.heappush(self._on_the_way, (at_ns, link, len(out.packet)))
+
+    def _arrive(self, now_ns: int) -> None:
+        """Count what has arrived."""
+        while self._on_the_way and self._on_the_way[0][0] <= now_ns:
+            _, link, size = heapq.heappop(self._on_the_way)
+            self._totals[link][3] += size
 
     def _message(self, sender: str, out: Outgoing, send_ns: int) -> None:
         key = (sender, out.message.id)
@@ -150,6 +163,7 @@ class ExchangeRecorder:
             raw: for comparison.
             now_ns: time of the last round.
         """
+        self._arrive(now_ns)  # no agent sees what comes after the last round
         message = schemas.new(
             "ExchangeSummary",
             team=team,

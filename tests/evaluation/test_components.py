@@ -118,7 +118,7 @@ def test_components_of_a_robot_and_a_peer_are_one_pair() -> None:
     session = Session(SimpleNamespace(robots={name: SimpleNamespace(component=(name,)) for name in NAMES}))
     text, number = np.array(["x", "x"]), np.array([0, 1])
     session.__dict__ |= {
-        "packets": Packets(number, text, text, text, np.array([300, 500]), np.array([True, True]), 2),
+        "packets": Packets(number, text, text, text, np.array([300, 500]), number > 1, np.ones(2, int), 2),
         "links": [Link("alpha", "bravo", 1, 0, 300), Link("bravo", "alpha-2", 1, 0, 500)],
         "summary": SimpleNamespace(
             rounds=2, bytes_raw_alternative=0, bytes_raw_alternative_maps_only=0, converged=True
