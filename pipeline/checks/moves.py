@@ -4,21 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.checks import MotionChecks
+from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.frontend.current_frame import features_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import visible
-from duagc.pipeline.recording import RgbdFrame, RgbdLog
+from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
+from duagc.pipeline.registration.feature_motion import motion_from_features
+from duagc.pipeline.registration.features import Features
 
 Image = NDArray[np.float32]
 
+FEATURES = RelocalizationConfig()
+"""How features are found and matched: as those of frames whose motion is not predicted."""
 WEAK_SHARE = 0.1  # of a direction of motion that the images do not determine
 
 
@@ -72,15 +80,50 @@ def moves(log: RgbdLog, config: MotionChecks, *, as_range: bool = False) -> list
     last = len(stamps) - 1
     for first in np.unique(np.linspace(0, last - 1, min(config.pairs, last)).astype(int)).tolist():
         near = int(np.searchsorted(stamps, stamps[first] + round(1e9 * config.pair_s), side="right")) - 1
-        frame, next_frame = log.frame(frames[first]), log.frame(frames[first + 1])
-        move = _move(frame, next_frame, log.camera, as_range=as_range)
+        view, following = _View(log, frames[first]), _View(log, frames[first + 1])
+        move = _move(view, following, as_range=as_range, T_guess=_matched(view, following))
         if near > first + 1:
-            farther = log.frame(frames[near])
-            T_guess = _extrapolated(move, farther.stamp_ns)
-            moved = _move(frame, farther, log.camera, as_range=as_range, T_guess=T_guess)
+            farther = _View(log, frames[near])
+            T_guess = _matched(view, farther)
+            if T_guess is None:
+                T_guess = _extrapolated(move, farther.frame.stamp_ns)
+            moved = _move(view, farther, as_range=as_range, T_guess=T_guess)
             move = move if moved.T_first_second is None else moved
         found.append(move)
     return found
+
+
+class _View:
+    """A frame of a pair, its pyramid and its features; these are made when they are first needed."""
+
+    def __init__(self, log: RgbdLog, index: int) -> None:
+        self.camera, self.frame = log.camera, log.frame(index)
+
+    def pyramid_of(self, depth_m: Image) -> RgbdPyramid:
+        """With some depth [h, w], meters along z."""
+        frame = self.frame
+        return RgbdPyramid.build(
+            frame.color.astype(np.float32) / 255,
+            depth_m,
+            self.camera,
+            depth_sigma_m=frame.depth_sigma,
+            mask=frame.mask,
+        )
+
+    @cached_property
+    def pyramid(self) -> RgbdPyramid:
+        return self.pyramid_of(self.frame.usable_depth)
+
+    @cached_property
+    def features(self) -> Features:
+        return features_of(self.pyramid, FEATURES)
+
+
+def _matched(first: _View, second: _View) -> Array | None:
+    """The motion [4, 4] that features agree on, which need no prediction; None: on none."""
+    # the draws only choose which samples are tried: the same for every pair
+    rng = random_streams.generator(0, "checks.moves")
+    return motion_from_features(first.features, second.features, FEATURES, rng).accepted_motion
 
 
 def _extrapolated(move: Move, to_ns: int) -> Array:
@@ -101,62 +144,34 @@ def _with_depth_of_their_own(log: RgbdLog) -> list[int]:
     return sorted(index for _, index in nearest.values())
 
 
-def _move(
-    first: RgbdFrame,
-    second: RgbdFrame,
-    camera: PinholeCamera,
-    *,
-    as_range: bool,
-    T_guess: Array | None = None,
-) -> Move:
+def _move(first: _View, second: _View, *, as_range: bool, T_guess: Array | None) -> Move:
     T_guess = np.eye(4) if T_guess is None else T_guess
-    depths = first.usable_depth, second.usable_depth
-    result = _registered(first, second, depths, camera, T_guess=T_guess)
+    result = register(Reference.from_pyramid(first.pyramid), second.pyramid, T_guess)
+    stamps_ns = first.frame.stamp_ns, second.frame.stamp_ns
     if not result.ok:
-        return Move(first.stamp_ns, second.stamp_ns, None)
-    T, depth_m = result.T_reference_target, depths[0]
+        return Move(*stamps_ns, None)
+    T, depths = result.T_reference_target, (first.frame.usable_depth, second.frame.usable_depth)
+    known = depths[0] > 0
     return Move(
-        first.stamp_ns,
-        second.stamp_ns,
+        *stamps_ns,
         T,
-        residual=_moved(*depths, T, camera),
+        residual=_moved(*depths, T, first.camera),
         sigma_m=_length_sigma_m(result),
         turned_rad=float(se3.distance(np.eye(4), T)[1]),
-        depth_m=float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0,
+        depth_m=float(np.median(depths[0][known])) if known.any() else 0.0,
         depth_rms_m=result.rms_depth_m,
-        depth_offset_ns=max(abs(first.depth_offset_ns), abs(second.depth_offset_ns)),
-        residual_as_range=_residual_as_range(first, second, camera, T_guess) if as_range else np.nan,
+        depth_offset_ns=max(abs(first.frame.depth_offset_ns), abs(second.frame.depth_offset_ns)),
+        residual_as_range=_residual_as_range(first, second, T_guess) if as_range else np.nan,
     )
 
 
-def _residual_as_range(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera, T_guess: Array) -> float:
+def _residual_as_range(first: _View, second: _View, T_guess: Array) -> float:
     """`Move.residual` if depth were the distance along the ray; NaN if that does not register."""
-    lengths = camera.ray_lengths().astype(np.float32)
-    along_z = first.usable_depth / lengths, second.usable_depth / lengths
-    result = _registered(first, second, along_z, camera, T_guess=T_guess)
-    return _moved(*along_z, result.T_reference_target, camera) if result.ok else np.nan
-
-
-def _registered(
-    first: RgbdFrame,
-    second: RgbdFrame,
-    depths: tuple[Image, Image],
-    camera: PinholeCamera,
-    *,
-    T_guess: Array,
-) -> Registration:
-    """The registration of two frames with some depth [h, w] of both, meters along z, from a motion [4, 4]."""
-    a, b = (
-        RgbdPyramid.build(
-            frame.color.astype(np.float32) / 255,
-            depth_m,
-            camera,
-            depth_sigma_m=frame.depth_sigma,
-            mask=frame.mask,
-        )
-        for frame, depth_m in zip((first, second), depths, strict=True)
-    )
-    return register(Reference.from_pyramid(a), b, T_guess)
+    lengths = first.camera.ray_lengths().astype(np.float32)
+    along_z = first.frame.usable_depth / lengths, second.frame.usable_depth / lengths
+    a, b = first.pyramid_of(along_z[0]), second.pyramid_of(along_z[1])
+    result = register(Reference.from_pyramid(a), b, T_guess)
+    return _moved(*along_z, result.T_reference_target, first.camera) if result.ok else np.nan
 
 
 def _length_sigma_m(result: Registration) -> float:
