@@ -118,7 +118,7 @@ class DepthMotion:
         """
         self._parts, self._gyro, self._kind = parts, gyro, kind
         self._kinds: dict[int, CurveKind] = {}  # by the number of a part
-        self._curves: dict[int, tuple[CurveKind, Array] | None] = {}  # by the time of a frame
+        self._curves: dict[int, _Curve | None] = {}  # by the time of a frame
 
     def between(self, color_ns: int, depth_ns: int) -> Array | None:
         """T_color_depth [4, 4], from the camera when depth was taken to the camera when color was.
@@ -147,25 +147,51 @@ class DepthMotion:
             self._curves[color_ns] = self._curve(color_ns)
         if (found := self._curves[color_ns]) is None:
             return None
-        kind, curve = found
-        T = _along(curve, color_ns, times_ns)
-        if self._gyro is not None and kind.gyro is not None:
-            turns = self._gyro.turns(color_ns, times_ns, kind.gyro)
+        T = found.along(color_ns, times_ns)
+        if self._gyro is not None and found.kind.gyro is not None:
+            turns = self._gyro.turns(color_ns, times_ns, found.kind.gyro)
             if turns is not None:
                 T[:, :3, :3] = turns
         return T
 
-    def _curve(self, color_ns: int) -> tuple[CurveKind, Array] | None:
-        """The curve around a frame, and of what kind it is."""
+    def _curve(self, color_ns: int) -> _Curve | None:
+        """The curve around a frame: by its pose and those near it, or, if it has none, by those before and after it."""
+        between = None
         for number, part in enumerate(self._parts):
-            at = int(np.searchsorted(part.stamps_ns, color_ns))
-            if at < len(part.stamps_ns) and part.stamps_ns[at] == color_ns:
-                if number not in self._kinds:
-                    self._kinds[number] = self._kind or CurveKind.of(part, self._gyro)
-                kind = self._kinds[number]
-                curve = _curve_in(part, at, kind.degree)
-                return None if curve is None else (kind, curve)
-        return None
+            after = int(np.searchsorted(part.stamps_ns, color_ns))
+            if after < len(part.stamps_ns) and part.stamps_ns[after] == color_ns:
+                return self._curve_in(number, after)
+            if 0 < after < len(part.stamps_ns) and between is None:
+                nearest = min(after - 1, after, key=lambda k: abs(int(part.stamps_ns[k]) - color_ns))
+                reached = part.stamps_ns[after] - part.stamps_ns[after - 1] <= 2 * REACH_NS
+                between = (number, nearest) if reached else None
+        return None if between is None else self._curve_in(*between)
+
+    def _curve_in(self, number: int, at: int) -> _Curve | None:
+        """The curve around a frame of a part that has a pose."""
+        part = self._parts[number]
+        if number not in self._kinds:
+            self._kinds[number] = self._kind or CurveKind.of(part, self._gyro)
+        kind = self._kinds[number]
+        curve = _curve_in(part, at, kind.degree)
+        return None if curve is None else _Curve(kind, int(part.stamps_ns[at]), curve)
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """Tangents from a frame as a polynomial of seconds, [degree + 1, 6]; around it or, without a pose, next to it."""
+
+    kind: CurveKind
+    from_ns: int
+    tangents: Array
+
+    def along(self, color_ns: int, times_ns: NDArray[np.int64]) -> Array:
+        """T_color_then [n, 4, 4]."""
+        here, then = (
+            np.vander(1e-9 * (ns - self.from_ns), len(self.tangents)) @ self.tangents
+            for ns in (np.array([color_ns]), times_ns)
+        )
+        return np.asarray(se3.inverse(se3.exp(here)) @ se3.exp(then))
 
 
 def _around(part: Trajectory, at: int) -> NDArray[np.intp]:
@@ -191,12 +217,6 @@ def _curve_in(part: Trajectory, at: int, degree: int = DEGREE) -> Array | None:
     if len(chosen) <= 2 * FRAMES_AROUND:
         degree = DEGREE if len(chosen) > 3 else 1
     return _fitted(part, at, chosen, degree)
-
-
-def _along(curve: Array, color_ns: int, times_ns: NDArray[np.int64]) -> Array:
-    """T_color_then [n, 4, 4] along a curve."""
-    then = np.vander(1e-9 * (times_ns - color_ns), len(curve)) @ curve
-    return np.asarray(se3.inverse(se3.exp(curve[-1])) @ se3.exp(then))
 
 
 def _degree_by(off: Mapping[int, Sequence[Array]], of_tangents: slice) -> int:

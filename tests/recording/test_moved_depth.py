@@ -204,6 +204,18 @@ def test_poses_that_do_not_say_move_nothing() -> None:
     assert DepthMotion(trajectory([4])).between(4 * FRAME_NS, 4 * FRAME_NS + 1) is None
 
 
+@pytest.mark.parametrize("lost", [[4], [3, 4, 5]])
+def test_a_lost_frame_moves_as_the_frames_before_and_after_it_say(lost: list[int]) -> None:
+    """In fast turns frames are lost because their depth is late: then nothing would ever move it."""
+    motion = DepthMotion(trajectory([k for k in range(9) if k not in lost]))
+    for k in lost:
+        found = motion.between(k * FRAME_NS, k * FRAME_NS - 18_000_000)
+        assert found is not None
+        seconds = 1e-9 * k * FRAME_NS
+        np.testing.assert_allclose(found, se3.inverse(place(seconds)) @ place(seconds - 0.018), atol=1e-12)
+    assert motion.between(9 * FRAME_NS, 9 * FRAME_NS - 18_000_000) is None, "nothing after it"
+
+
 def test_a_log_moves_its_depth_once_it_knows_how(tmp_path: Path) -> None:
     late_ns = 14_000_000
     with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
