@@ -125,7 +125,8 @@ def registered_again(
 ) -> list[TrackedFrame]:
     """The frames, with better poses of those that were found while nothing said how the camera moved then.
 
-    Their depth and their rows were as they were taken; by the poses that were found they are moved now.
+    Their depth and their rows were as they were taken; by the poses that were found they are moved now. Of those that
+    were followed by color alone, because depth of another time contradicted it, depth counts where it fits now.
 
     Args:
         frames: every frame of the log, with those that were found.
@@ -135,15 +136,22 @@ def registered_again(
         config: of the front end.
     """
     tracking = config.tracking.verified_by_features()
+    usual = [
+        f.rms_gray for f in frames if f.status is Status.OK and f.reason is Reason.NONE and f.rms_gray > 0
+    ]
+    fitting = tracking.failure.color_check_gray_of_usual * float(np.median(usual)) if usual else np.inf
     out = list(frames)
     for k, (frame, was) in enumerate(zip(frames, before, strict=True)):
-        if frame.status is Status.LOST or was.status is not Status.LOST:
+        by_color = frame.reason is Reason.CONTRADICTION
+        if frame.status is Status.LOST or not (by_color or was.status is Status.LOST):
             continue
         keyframe = keyframes[frame.keyframe_index]
         pyramid = images(frame.frame_index, len(tracking.strides))
         result = register_until_stable(
             keyframe, pyramid, frame.T_keyframe_camera, tracking, first=tracking.registration
         )
+        if by_color and result.rms_gray > fitting:
+            continue
         features = features_of(pyramid, tracking.relocalization)
         if result.ok and _confirmed(keyframe, features, result, config, rng=_draws(frame, keyframe)):
             out[k] = _relocalized(frame, keyframe, result)

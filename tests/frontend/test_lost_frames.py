@@ -10,7 +10,7 @@ import pytest
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
 from duagc.pipeline.frontend import reach
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.lost_frames import found_afterwards, without_jumps
+from duagc.pipeline.frontend.lost_frames import found_afterwards, registered_again, without_jumps
 from duagc.pipeline.frontend.submaps import lost
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
@@ -99,3 +99,32 @@ def test_frames_whose_images_cannot_be_used_stay_lost(run: Undisturbed) -> None:
 def test_a_loss_at_the_end_has_no_second_neighbor(run: Undisturbed) -> None:
     frames = with_loss(run, END - 1, Reason.RESIDUAL)
     assert looked_for(run, frames, {}) == frames
+
+
+@pytest.mark.parametrize("late", [0, 6])
+def test_what_was_followed_by_color_is_registered_again_where_its_depth_fits(
+    run: Undisturbed, late: int
+) -> None:
+    """Depth that is moved now; or that of six frames before, still."""
+    keyframes = run.tracker(END).keyframes
+    frames = list(run.frames[:END])
+    off = se3.exp(np.array([0.03, 0.0, 0.0, 0.0, 0.01, 0.0]))
+    frames[LOST] = replace(
+        frames[LOST],
+        reason=Reason.CONTRADICTION,
+        T_keyframe_camera=frames[LOST].T_keyframe_camera @ off,
+    )
+
+    def images(frame_index: int, levels: int) -> RgbdPyramid:
+        color, depth = run.shots[frame_index].color, run.shots[frame_index - late].depth
+        return RgbdPyramid.build(color / np.float32(255), depth, CAMERA, levels)
+
+    found = registered_again(frames, frames, keyframes, images, config=CONFIG)
+    changed = [k for k, (a, b) in enumerate(zip(found, frames, strict=True)) if a is not b]
+    assert changed == ([] if late else [LOST])
+    if not late:
+        assert found[LOST].reason is Reason.NONE
+        T_map_keyframe = keyframes[found[LOST].keyframe_index].T_map_keyframe
+        moved_m, turned_rad = se3.distance(T_map_keyframe @ found[LOST].T_keyframe_camera, run.poses[LOST])
+        assert moved_m < 0.003
+        assert turned_rad < 0.002
