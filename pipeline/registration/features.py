@@ -8,7 +8,7 @@ and do not depend on the order of the sum.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,28 @@ Descriptors = NDArray[np.uint8]
 DIMENSIONS = 128
 LEAST_PX = 50_000  # of the image that features are looked for in
 DARK, DARK_PERCENT = 100, 99  # gray value that one pixel in a hundred of a well exposed image exceeds
+FEW_DEPTHS = 0.5  # share of the usable pixels with depth below which features without depth are kept, too
 SCALE = 512.0  # RootSIFT entries are at most 1 and mostly below 0.5; larger ones saturate at one byte
+
+
+@dataclass(frozen=True)
+class Bearings:
+    """Keypoints without depth, strongest response first.
+
+    Attributes:
+        descriptors: uint8 [n, 128].
+        rays: float32 [n, 3], camera frame, their z is 1.
+        pixel: width of a pixel at a depth of 1; 0: they were not looked for.
+        few_depths: whether most of the image has no depth.
+    """
+
+    descriptors: Descriptors
+    rays: NDArray[np.float32]
+    pixel: float = 0.0
+    few_depths: bool = False
+
+
+NO_BEARINGS = Bearings(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 3), np.float32))
 
 
 @dataclass(frozen=True)
@@ -34,10 +55,12 @@ class Features:
     Attributes:
         descriptors: uint8 [n, 128].
         points: float32 [n, 3], meters, camera frame.
+        bearings: keypoints without depth, where they were looked for.
     """
 
     descriptors: Descriptors
     points: NDArray[np.float32]
+    bearings: Bearings = NO_BEARINGS
 
     def __len__(self) -> int:
         return len(self.points)
@@ -94,13 +117,24 @@ def extract_from_gray(
         mask: bool [h, w], pixels that may be used; None: all.
     """
     known = depth_m > 0 if mask is None else (depth_m > 0) & mask
+    usable = _usable(depth_m > 0, mask)
+    return _with_depth(strongest_keypoints(brightened(gray, known), most, usable), depth_m, camera)
+
+
+def _usable(where: masks.Mask, mask: masks.Mask | None) -> Callable[[Array, Array, Array], NDArray[np.bool_]]:
+    """Whether keypoints, by u, v and size [n] each, pixels, lie somewhere, and far enough from masked pixels."""
+    height, width = where.shape
 
     def usable(u: Array, v: Array, size: Array) -> masks.Mask:
-        row, column = nearest_pixel(v, camera.height), nearest_pixel(u, camera.width)
-        has_depth = depth_m[row, column] > 0
-        return has_depth if mask is None else has_depth & (masks.distance_px(mask)[row, column] > size)
+        row, column = nearest_pixel(v, height), nearest_pixel(u, width)
+        there = where[row, column]
+        return there if mask is None else there & (masks.distance_px(mask)[row, column] > size)
 
-    found = strongest_keypoints(brightened(gray, known), most, usable)
+    return usable
+
+
+def _with_depth(found: Keypoints, depth_m: NDArray[np.float32], camera: PinholeCamera) -> Features:
+    """Features of keypoints that have a depth."""
     u, v = found.pixels.T
     z = depth_m[nearest_pixel(v, camera.height), nearest_pixel(u, camera.width)].astype(np.float64)
     return Features(found.descriptors, back_project(camera, u, v, z).astype(np.float32))
@@ -151,20 +185,67 @@ def strongest_keypoints(
         usable: whether keypoints are, bool [n], by u, v and size [n] each, pixels.
         place: where keypoints [n, 2] of the image lie; by default there.
     """
-    import cv2
+    return _detected(image, most, usable, place).strongest(most, usable)
 
-    for limit in (2 * most, 0):
+
+def _detected(
+    image: NDArray[np.uint8],
+    most: int,
+    usable: Callable[[Array, Array, Array], NDArray[np.bool_]],
+    place: Callable[[Array], Array] = lambda pixels: pixels,
+    *,
+    all_of_them: bool = False,
+) -> _Detected:
+    """Twice as many keypoints as are wanted, or all, if there are too few usable ones among those."""
+    for limit in (0,) if all_of_them else (2 * most, 0):
+        found = _Detected.of(image, limit, place)
+        u, v = found.pixels.T
+        if np.count_nonzero(usable(u, v, found.sizes)) >= most or len(found.sizes) < limit:
+            break
+    return found
+
+
+@dataclass(frozen=True)
+class _Detected:
+    """All that SIFT finds in an image.
+
+    Attributes:
+        sift: [n, 128].
+        pixels: (u, v) [n, 2].
+        responses: [n].
+        angles: [n].
+        sizes: [n], diameters of the blobs, pixels.
+    """
+
+    sift: NDArray[np.float32]
+    pixels: Array
+    responses: Array
+    angles: Array
+    sizes: Array
+
+    @staticmethod
+    def of(
+        image: NDArray[np.uint8], limit: int, place: Callable[[Array], Array] = lambda pixels: pixels
+    ) -> _Detected:
+        """The strongest, about so many; 0: all."""
+        import cv2
+
         keypoints, sift = cv2.SIFT.create(nfeatures=limit).detectAndCompute(image, None)
         if not keypoints:
-            return NO_KEYPOINTS
+            none = np.zeros(0)
+            return _Detected(np.zeros((0, DIMENSIONS), np.float32), np.zeros((0, 2)), none, none, none)
         pixels = place(np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2))
-        u, v = pixels.T
-        response, angle, size = np.array([(k.response, k.angle, k.size) for k in keypoints]).T
-        order = np.lexsort((angle, u, v, -response))
-        order = order[usable(u, v, size)[order]][:most]
-        if len(order) == most or len(keypoints) < limit:
-            break
-    return Keypoints(root_sift(np.asarray(sift[order], np.float32)), pixels[order], response[order])
+        responses, angles, sizes = np.array([(k.response, k.angle, k.size) for k in keypoints]).T
+        return _Detected(np.asarray(sift, np.float32), pixels, responses, angles, sizes)
+
+    def strongest(self, most: int, usable: Callable[[Array, Array, Array], NDArray[np.bool_]]) -> Keypoints:
+        """The strongest that are usable, as of `strongest_keypoints`."""
+        if not len(self.sizes):
+            return NO_KEYPOINTS
+        u, v = self.pixels.T
+        order = np.lexsort((self.angles, u, v, -self.responses))
+        order = order[usable(u, v, self.sizes)[order]][:most]
+        return Keypoints(root_sift(self.sift[order]), self.pixels[order], self.responses[order])
 
 
 def brightened(gray: NDArray[np.uint8], usable: masks.Mask) -> NDArray[np.uint8]:
@@ -185,7 +266,8 @@ def brightened(gray: NDArray[np.uint8], usable: masks.Mask) -> NDArray[np.uint8]
 def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> Features:
     """`extract` from the finest image of a pyramid that is not wider than a limit, or the coarsest if all are.
 
-    An image of less than `LEAST_PX` pixels shows too little: then the next finer one is taken, if there is one.
+    Features without depth are kept, too: where less than half of the image has depth, of all that there are. An image
+    of less than `LEAST_PX` pixels shows too little: then the next finer one is taken, if there is one.
 
     Args:
         pyramid: of the view.
@@ -198,7 +280,28 @@ def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> 
     level = levels[at - 1 if at and small else at]
     gray = np.rint(np.clip(level.gray, 0, 1) * 255).astype(np.uint8)
     depth_m = inverse_or_zero(level.inverse_depth)
-    return extract_from_gray(gray, depth_m, level.camera, most, mask=level.mask)
+    known = depth_m > 0 if level.mask is None else (depth_m > 0) & level.mask
+    few, image = has_few_depths(pyramid), brightened(gray, known)
+    found = _detected(image, most, _usable(depth_m > 0, level.mask), all_of_them=few)
+    features = _with_depth(found.strongest(most, _usable(depth_m > 0, level.mask)), depth_m, level.camera)
+    others = found.strongest(most, _usable(depth_m == 0, level.mask))
+    u, v = others.pixels.T
+    rays = back_project(level.camera, u, v, np.ones(len(u))).astype(np.float32)
+    return replace(features, bearings=Bearings(others.descriptors, rays, 1 / level.camera.fx, few))
+
+
+def has_few_depths(pyramid: RgbdPyramid) -> bool:
+    """Whether less than half of the pixels that may be used have depth, but some have.
+
+    Args:
+        pyramid: of the view.
+    """
+    coarsest = pyramid.levels[-1]
+    known = coarsest.inverse_depth > 0
+    count = known.size if coarsest.mask is None else int(np.count_nonzero(coarsest.mask))
+    if coarsest.mask is not None:
+        known &= coarsest.mask
+    return 0 < int(np.count_nonzero(known)) < FEW_DEPTHS * count
 
 
 def root_sift(sift: NDArray[np.float32]) -> Descriptors:

@@ -6,7 +6,13 @@ import pytest
 
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.registration import RgbdPyramid
-from duagc.pipeline.registration.features import brightened, extract, extract_from_pyramid, matches
+from duagc.pipeline.registration.features import (
+    brightened,
+    extract,
+    extract_from_pyramid,
+    has_few_depths,
+    matches,
+)
 
 CAMERA = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5)
 DEPTH = np.full((120, 160), 2.0, np.float32)
@@ -91,3 +97,29 @@ def test_features_come_from_an_image_that_shows_enough(width: int, height: int, 
     alone = RgbdPyramid(pyramid.levels[level : level + 1])
     np.testing.assert_array_equal(found.points, extract_from_pyramid(alone, 1000, 100).points)
     assert len(found) > 20
+
+
+@pytest.mark.parametrize(("rows", "few"), [(40, True), (80, False)])
+def test_features_without_depth_are_kept_beside_those_with_depth(rows: int, few: bool) -> None:
+    color = np.repeat(np.rint(blobs())[..., None], 3, axis=2).astype(np.uint8)
+    depth, mask = DEPTH.copy(), np.ones(DEPTH.shape, bool)
+    depth[rows:], mask[:, :20] = 0, False
+    pyramid = RgbdPyramid.build(color, depth, CAMERA, 3, mask=mask)
+    assert has_few_depths(pyramid) == few
+    found = extract_from_pyramid(pyramid, 400, 100)
+    assert found.bearings.few_depths == few
+    assert found.bearings.pixel == pytest.approx(1 / CAMERA.fx)
+    assert len(found) > 10
+    assert len(found.bearings.rays) > 10
+    points = found.points / found.points[:, 2:]
+    for rays, inside in ((points, np.s_[:rows]), (found.bearings.rays, np.s_[rows:])):
+        u, v = CAMERA.project(rays.astype(np.float64)).T
+        seen = np.zeros(DEPTH.shape, bool)
+        seen[inside] = True
+        assert seen[np.rint(v).astype(int), np.rint(u).astype(int)].all()
+        assert (u > 20).all()
+
+
+def test_an_image_without_any_depth_is_followed_otherwise() -> None:
+    color = np.repeat(np.rint(blobs())[..., None], 3, axis=2).astype(np.uint8)
+    assert not has_few_depths(RgbdPyramid.build(color, np.zeros_like(DEPTH), CAMERA, 3))
