@@ -34,6 +34,7 @@ from duagc.pipeline.registration import (
     RgbdPyramid,
     linearize,
 )
+from duagc.pipeline.registration.bearing_motion import BearingMatches, BearingMotion, motion_from_bearings
 from duagc.pipeline.registration.features import Features
 
 Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
@@ -172,16 +173,17 @@ class _Costs:
     ) -> None:
         self._views, self._registration = views, registration
         self._images = images
-        self._min_overlap = 0.8 * config.optimization_overlap
+        self._min_overlap, self._ratio = 0.8 * config.optimization_overlap, config.judgment.ratio
         self._tracked = {(pair.i, pair.j): pair for pair in tracked}
         self._held: set[Ends] = set()  # pairs that keep to tracking
         self._found: dict[Ends, RelativePose | None] = {}  # None: the images cannot be compared
         self._where: dict[Ends, tuple[Array, int]] = {}  # motion and level of the last expansion
         self._exposures: dict[Ends, tuple[float, float]] = {}  # of (reference, target)
+        self._by_bearings: dict[Ends, BearingMotion | None] = {}  # None: too few agree, or depth is enough
 
     def expanded(self) -> tuple[Any, ...]:
         """All that was expanded; `go_on` takes it."""
-        return self._found, self._where, self._exposures, self._held
+        return self._found, self._where, self._exposures, self._held, self._by_bearings
 
     def go_on(self, expanded: tuple[Any, ...]) -> None:
         """Go on from what was expanded before.
@@ -189,7 +191,7 @@ class _Costs:
         Args:
             expanded: by other costs of the same keyframes.
         """
-        self._found, self._where, self._exposures, self._held = expanded
+        self._found, self._where, self._exposures, self._held, self._by_bearings = expanded
 
     def factors(self, ends: Sequence[Ends]) -> list[RelativePose]:
         """The quadratics of pairs; of one that cannot be compared, the registration of tracking, if there is one.
@@ -234,13 +236,33 @@ class _Costs:
                 results[reference, target] = result
         for first, second in ends:
             T_first_second = se3.inverse(T[first]) @ T[second]
-            self._found[first, second] = _factor(
+            factor = _factor(
                 (first, second),
                 T_first_second,
                 forward=results.get((first, second)),
                 backward=results.get((second, first)),
             )
+            self._found[first, second] = self._with_bearings(factor, T_first_second)
             self._where[first, second] = T_first_second, level
+
+    def _with_bearings(self, factor: RelativePose | None, T_first_second: Array) -> RelativePose | None:
+        """The cost of a pair and that of its features without depth, where most of the images have none."""
+        if factor is None:
+            return None
+        ends = factor.i, factor.j
+        if ends not in self._by_bearings:
+            first, second = (self._views[k].features for k in ends)
+            few = first.bearings.few_depths or second.bearings.few_depths
+            matched = BearingMatches.of(first, second, self._ratio) if few else None
+            motion = None if matched is None else motion_from_bearings(matched, [T_first_second])
+            self._by_bearings[ends] = motion if motion is not None and motion.accepted else None
+        motion = self._by_bearings[ends]
+        if motion is None:
+            return factor
+        away = se3.log(se3.inverse(factor.T_i_j) @ motion.T_first_second)
+        information = factor.information + motion.information
+        step = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ (motion.information @ away)
+        return RelativePose(*ends, factor.T_i_j @ se3.exp(step), information)
 
     def _moved(self, pair: Ends, T: Array, level: int) -> bool:
         if pair not in self._where or self._where[pair][1] != level:

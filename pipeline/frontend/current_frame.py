@@ -11,7 +11,7 @@ from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels
 from duagc.pipeline.registration import Level, Registration, RgbdPyramid
-from duagc.pipeline.registration.features import Features, extract_from_pyramid
+from duagc.pipeline.registration.features import Features, extract_from_pyramid, has_few_depths
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,11 @@ class CurrentFrame:
         """Its features; computed when first needed."""
         return features_of(self.pyramid, self.relocalization)
 
+    @cached_property
+    def has_few_depths(self) -> bool:
+        """Whether less than half of its image has depth."""
+        return has_few_depths(self.pyramid)
+
 
 def features_of(pyramid: RgbdPyramid, config: RelocalizationConfig) -> Features:
     """The features by which a frame is relocalized, and to which it is compared as a keyframe.
@@ -87,9 +92,11 @@ class PoseCandidate:
         result: the registration.
         without: why only its color, or only its depth, was used.
         unlike: whether it looked unlike the keyframe, and color alone confirmed it.
+        by_bearings: whether features confirm it, most of them without depth.
     """
 
     keyframe_index: int
     result: Registration
     without: Reason = Reason.NONE
     unlike: bool = False
+    by_bearings: bool = False

@@ -8,6 +8,7 @@ import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.shelf import SHELF
+from duagc.pipeline.frontend.bearing_registration import register_few_depths
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
@@ -93,8 +94,10 @@ def _neighbor_registrations(
     candidates.sort(key=lambda candidate: candidate[:2])
     pairs = []
     for _, negative_index, guess in candidates[: limits.neighbors]:
-        reference = state.keyframes[-negative_index].reference
-        result = register(reference, frame.pyramid, guess, state.config.tracking.registration)
+        tracking, keyframe = state.config.tracking, state.keyframes[-negative_index]
+        result = register_few_depths(keyframe, frame, guess, tracking)
+        if result is None:
+            result = register(keyframe.reference, frame.pyramid, guess, tracking.registration)
         if result.ok and result.overlap >= limits.neighbor_overlap:
             new = len(state.keyframes)
             pairs.append(RelativePose(-negative_index, new, result.T_reference_target, result.information))

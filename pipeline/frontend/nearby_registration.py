@@ -8,11 +8,13 @@ from itertools import product
 import numpy as np
 
 from duagc.pipeline.config.frontend import TrackingConfig
+from duagc.pipeline.frontend.bearing_registration import register_by_bearings
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.feature_initialization import initial_motion, initial_motions
 from duagc.pipeline.frontend.pose_checks import (
     FOLLOWED,
+    FOUND_BY_BEARINGS,
     FOUND_BY_FEATURES,
     FOUND_FROM_ALL_AROUND,
     FOUND_NEARBY,
@@ -41,7 +43,7 @@ def register_nearby(state: TrackingState, frame: CurrentFrame) -> PoseCandidate 
     for candidate, checks in _attempts(state, frame):
         found = verify(checks, state, frame, candidate)
         if isinstance(found, PoseCandidate):
-            return _looking_as_usual(state, frame, found)
+            return found if found.by_bearings else _looking_as_usual(state, frame, found)
         reason = reason if reason is not Reason.NONE else found
     return reason
 
@@ -174,6 +176,9 @@ def _attempts(
     starts = [predicted]
     if predicted.T_keyframe_camera is not last:
         starts.append(Prediction(last, None))
+    few = frame.has_few_depths or state.keyframe.features.bearings.few_depths
+    if few and (by_bearings := _by_bearings(state, frame, predicted)) is not None:
+        yield by_bearings, FOUND_BY_BEARINGS
     if weak:
         for candidate in _from_features(state, frame, tracking.verified_by_features()):
             yield candidate, FOUND_BY_FEATURES
@@ -198,6 +203,22 @@ def _attempts(
     if little and not weak:
         for candidate in _sharing_little(state, frame, predicted):
             yield candidate, FOUND_BY_FEATURES
+    if not few and (by_bearings := _by_bearings(state, frame, predicted)) is not None:
+        yield by_bearings, FOUND_BY_BEARINGS
+
+
+def _by_bearings(state: TrackingState, frame: CurrentFrame, predicted: Prediction) -> PoseCandidate | None:
+    """The registration that features with and without depth lead to, from the prediction or from the last pose."""
+    tracking = state.config.tracking
+    result = register_by_bearings(
+        state.keyframe,
+        frame.pyramid,
+        frame.features,
+        [predicted.T_keyframe_camera, state.T_keyframe_camera],
+        config=tracking.verified_by_features().registration,
+        ratio=tracking.relocalization.ratio,
+    )
+    return None if result is None else PoseCandidate(state.keyframe_index, result, by_bearings=True)
 
 
 def _sharing_little(

@@ -10,11 +10,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.frontend.bearing_registration import register_few_depths
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels, hidden_pixels
 from duagc.pipeline.frontend.nearby_registration import fits_better, register_nearby, went_far
-from duagc.pipeline.frontend.pose_checks import FOLLOWED, verify
+from duagc.pipeline.frontend.pose_checks import FOLLOWED, FOUND_BY_BEARINGS, verify
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Level, register
@@ -93,11 +94,8 @@ def _registered_there(
     state: TrackingState, frame: CurrentFrame, whole: PoseCandidate, hidden: HiddenPixels
 ) -> tuple[CurrentFrame, PoseCandidate] | None:
     """A frame without what may hide it, from where it was found as a whole; None: it does not stay there."""
-    reference, clear = state.keyframes[whole.keyframe_index].reference, frame.without(hidden)
-    T_found = whole.result.T_reference_target
-    result = register(reference, clear.pyramid, T_found, state.config.tracking.registration)
-    there = replace(whole, result=result)
-    if not result.ok or _apart(state, whole, there):
+    there = _registered_from(state, frame.without(hidden), whole)
+    if not there.result.ok or _apart(state, whole, there):
         return None
     return frame.without(_hidden(state, frame, state.in_map(there))), there
 
@@ -135,10 +133,20 @@ def _register_without(
     clear = frame.without(_hidden(state, frame, state.in_map(found)))
     if found.without is not Reason.NONE:
         return clear, found
-    keyframe, registration = state.keyframes[found.keyframe_index], state.config.tracking.registration
-    result = register(keyframe.reference, clear.pyramid, found.result.T_reference_target, registration)
-    again = verify(FOLLOWED, state, clear, replace(found, result=result))
-    return (clear, again) if isinstance(again, PoseCandidate) else None
+    again = _registered_from(state, clear, found)
+    verified = verify(FOUND_BY_BEARINGS if again.by_bearings else FOLLOWED, state, clear, again)
+    return (clear, verified) if isinstance(verified, PoseCandidate) else None
+
+
+def _registered_from(state: TrackingState, clear: CurrentFrame, found: PoseCandidate) -> PoseCandidate:
+    """A frame without what may hide it, registered to the same keyframe from where it was found."""
+    tracking, keyframe = state.config.tracking, state.keyframes[found.keyframe_index]
+    T_found = found.result.T_reference_target
+    result = register_few_depths(keyframe, clear, T_found, tracking)
+    if result is not None:
+        return replace(found, result=result, by_bearings=True)
+    result = register(keyframe.reference, clear.pyramid, T_found, tracking.registration)
+    return replace(found, result=result, by_bearings=False)
 
 
 def _hidden(state: TrackingState, frame: CurrentFrame, T_map_camera: Array) -> HiddenPixels:

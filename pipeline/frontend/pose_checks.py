@@ -310,6 +310,14 @@ FOUND_BY_FEATURES: tuple[PoseCheck, ...] = (
 """Checks of a pose that was found from matched features, whose descriptors say that it looks alike: far from its
 keyframe a frame overlaps little, and its gray values fit less well than from near."""
 
+FOUND_BY_BEARINGS: tuple[PoseCheck, ...] = (
+    LooksNoWorseThanUsual(),
+    RespectsFreeSpace(),
+    WithinReach(),
+    FeaturesDoNotContradict(),
+)
+"""Checks of a pose that features with and without depth agree on: they may be of what moves with the camera."""
+
 FOUND_FROM_ALL_AROUND: tuple[PoseCheck, ...] = (
     LooksNoWorseThanUsual(),
     RespectsFreeSpace(),
