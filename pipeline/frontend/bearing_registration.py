@@ -17,7 +17,7 @@ MOST_SPREAD = 2.0
 """Standard deviation of matches at an accepted pose, in those at the motion that they agree on."""
 
 
-class View(Protocol):
+class RegisteredView(Protocol):
     """What other views are registered to."""
 
     @property
@@ -32,7 +32,7 @@ class View(Protocol):
 
 
 def register_few_depths(
-    view: View, frame: CurrentFrame, guess: Array, config: TrackingConfig
+    view: RegisteredView, frame: CurrentFrame, guess: Array, config: TrackingConfig
 ) -> Registration | None:
     """`register_by_bearings` of two views, of which one has depth on less than half of its image, else None.
 
@@ -55,7 +55,7 @@ def register_few_depths(
 
 
 def register_by_bearings(
-    view: View,
+    view: RegisteredView,
     pyramid: RgbdPyramid,
     features: Features,
     starts: Sequence[Array],

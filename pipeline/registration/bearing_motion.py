@@ -312,7 +312,7 @@ class _Residuals:
             1.0, DEPTH_SIGMA / LEAST_SIGMA_PX / matched.pixel * np.linalg.norm(moved, axis=-1)
         )
         share = np.where(is_open, 0.0, np.where(unknown, 1.0, 1 / by_depth))
-        jacobian = _derivatives(matched, R, place, z, rho)
+        jacobian = _derivatives(matched, R, place, z, rho=rho)
         axes = np.stack([np.stack([-unit[..., 1], unit[..., 0]], axis=-1), share[..., None] * unit], axis=-2)
         axes /= matched.pixel
         residual = (axes @ (place - matched.sought)[..., None])[..., 0]
@@ -334,7 +334,7 @@ def _segments(matched: BearingMatches, far: Array, along: Array) -> tuple[Array,
     return unit, np.where(fits, top / np.where(fits, bottom, 1.0), 0.0)
 
 
-def _derivatives(matched: BearingMatches, R: Array, place: Array, z: Array, rho: Array) -> Array:
+def _derivatives(matched: BearingMatches, R: Array, place: Array, z: Array, *, rho: Array) -> Array:
     """Of places [s, n, 2], z times nearer than their inverse depths, by the right tangents, [s, n, 2, 6]."""
     k, (x, y) = matched.forward, (place[..., 0], place[..., 1])
     one, none = np.ones_like(x), np.zeros_like(x)
