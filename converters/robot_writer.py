@@ -355,7 +355,7 @@ class RobotWriter:
             "depth_scale_m": self.depth_scale,
             "sensors": self.sensors,
             "digests": {self._log.path.name: self._log.digest, **self._truth.digests},
-            "path": self._truth.way,
+            "path": self._truth.path,
             "color_digests": sorted(self._colors),
         }
         if self._valid is not None:

@@ -66,7 +66,7 @@ class TruthWriter:
         return {} if self._open is None else {self._open.path.name: self._open.digest}
 
     @property
-    def way(self) -> dict[str, float | list[float]] | None:
+    def path(self) -> dict[str, float | list[float]] | None:
         """How long the true path is, and the corners of the box around it, meters; None: no pose is known."""
         if not self._positions:
             return None

@@ -117,18 +117,20 @@ def extract_from_gray(
         mask: bool [h, w], pixels that may be used; None: all.
     """
     known = depth_m > 0 if mask is None else (depth_m > 0) & mask
-    usable = _usable(depth_m > 0, mask)
+    usable = _usable(depth_m > 0, None if mask is None else masks.distance_px(mask))
     return _with_depth(strongest_keypoints(brightened(gray, known), most, usable), depth_m, camera)
 
 
-def _usable(where: masks.Mask, mask: masks.Mask | None) -> Callable[[Array, Array, Array], NDArray[np.bool_]]:
+def _usable(
+    where: masks.Mask, from_masked_px: NDArray[np.float32] | None
+) -> Callable[[Array, Array, Array], NDArray[np.bool_]]:
     """Whether keypoints, by u, v and size [n] each, pixels, lie somewhere, and far enough from masked pixels."""
     height, width = where.shape
 
     def usable(u: Array, v: Array, size: Array) -> masks.Mask:
         row, column = nearest_pixel(v, height), nearest_pixel(u, width)
         there = where[row, column]
-        return there if mask is None else there & (masks.distance_px(mask)[row, column] > size)
+        return there if from_masked_px is None else there & (from_masked_px[row, column] > size)
 
     return usable
 
@@ -282,9 +284,11 @@ def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> 
     depth_m = inverse_or_zero(level.inverse_depth)
     known = depth_m > 0 if level.mask is None else (depth_m > 0) & level.mask
     few, image = has_few_depths(pyramid), brightened(gray, known)
-    found = _detected(image, most, _usable(depth_m > 0, level.mask), all_of_them=few)
-    features = _with_depth(found.strongest(most, _usable(depth_m > 0, level.mask)), depth_m, level.camera)
-    others = found.strongest(most, _usable(depth_m == 0, level.mask))
+    from_masked_px = None if level.mask is None else masks.distance_px(level.mask)
+    with_depth, without = (_usable(where, from_masked_px) for where in (depth_m > 0, depth_m == 0))
+    found = _detected(image, most, with_depth, all_of_them=few)
+    features = _with_depth(found.strongest(most, with_depth), depth_m, level.camera)
+    others = found.strongest(most, without)
     u, v = others.pixels.T
     rays = back_project(level.camera, u, v, np.ones(len(u))).astype(np.float32)
     return replace(features, bearings=Bearings(others.descriptors, rays, 1 / level.camera.fx, few))
