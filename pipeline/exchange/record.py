@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import heapq
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from duagc import schemas
-from duagc.pipeline.base.component_names import robot_of, same_robot
+from duagc.pipeline.base.component_names import same_robot
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.exchange.map_agent import MapAgent
+from duagc.pipeline.exchange.raw_alternative import RawAlternative
 from duagc.pipeline.messages import map_frame, pack_pose, pack_stamp
 from duagc.pipeline.messages.parts import pack_information
 from duagc.pipeline.network.link_model import Fate
@@ -26,35 +26,8 @@ from duagc.pipeline.network.packets import (
     payload_bytes,
 )
 from duagc.pipeline.recording import LogWriter, read_log
-from duagc.pipeline.runs.robot_data import RobotData, SessionResult
+from duagc.pipeline.runs.robot_data import SessionResult
 from duagc.schemas import topics
-
-
-@dataclass(frozen=True)
-class RawAlternative:
-    """Bytes of sending everything to every other robot once, without any protocol.
-
-    Attributes:
-        maps_and_information: every Gaussian (14 float32) with the part of its information that fusion needs (31
-            float32), and every relative pose (40 bytes): the least that would allow the same fusion.
-        maps_only: without the information, which allows to render the neighbors' maps and not to fuse them.
-    """
-
-    maps_and_information: int
-    maps_only: int
-
-    @staticmethod
-    def of(data: Sequence[RobotData]) -> RawAlternative:
-        """What it takes for a team; components of one robot count as that robot.
-
-        Args:
-            data: of all robots, or of their components.
-        """
-        others = len({robot_of(d.robot) for d in data}) - 1
-        gaussians, factors = sum(len(d.gaussians) for d in data), sum(len(d.registrations) for d in data)
-        return RawAlternative(
-            others * (4 * (14 + 31) * gaussians + 40 * factors), others * (4 * 14 * gaussians + 40 * factors)
-        )
 
 
 def _write(writer: LogWriter, topic: str, message: Any, now_ns: int) -> None:
@@ -77,9 +50,8 @@ class ExchangeRecorder:
         self._on_air: set[tuple[str, int]] = set()  # of these, what a radio carried
         self._by_content: dict[bytes, tuple[str, int]] = {}
         self._totals: dict[tuple[str, str, str], list[int]] = {}  # packets, dropped, bytes, bytes delivered
-        self._on_the_way: list[
-            tuple[int, tuple[str, str, str], int]
-        ] = []  # a heap: arrival (ns), link, bytes
+        # a heap: arrival (ns), link, bytes
+        self._on_the_way: list[tuple[int, tuple[str, str, str], int]] = []
 
     def packet(self, sender: str, out: Outgoing, *, round_index: int, send_ns: int, fate: Fate) -> None:
         """Record one packet, and its message if this is the first packet of it.

@@ -14,7 +14,8 @@ from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange.injection import check_liar
 from duagc.pipeline.exchange.map_agent import MapAgent
-from duagc.pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder, RawAlternative
+from duagc.pipeline.exchange.raw_alternative import RawAlternative
+from duagc.pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder
 from duagc.pipeline.exchange.rounds import run_rounds
 from duagc.pipeline.exchange.session_result import result_of
 from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM

@@ -14,7 +14,8 @@ from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.evaluation import network
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.exchange.record import RawAlternative, read_session
+from duagc.pipeline.exchange.raw_alternative import RawAlternative
+from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.network.packets import Kind
 from duagc.pipeline.recording import read_log
