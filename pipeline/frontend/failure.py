@@ -17,6 +17,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FailureConfig
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels, carried
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.inverse_depth import chance_difference
 from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.kernels.free_space import free_space
 from duagc.pipeline.kernels.free_space_definition import FREE, UNKNOWN
@@ -227,7 +228,7 @@ def free_space_violations(
     """How many pixels of a view are in space that a keyframe saw to be free, and how many it can judge at all.
 
     A pixel violates free space if its point is nearer than all that the keyframe measured in the 3x3 pixels around its
-    projection, by more than the gate. Surfaces that come in from the side are outside the keyframe's view.
+    projection, by more than the gates and noise. Surfaces that come in from the side are outside the keyframe's view.
 
     Args:
         level: one resolution of the view.
@@ -245,6 +246,7 @@ def free_space_violations(
         level.camera,
         gate_m=config.free_space_gate_m,
         gate_relative=config.free_space_gate_relative,
+        gate_inverse=chance_difference(level.noise, keyframe.noise),
     )
     return int(np.count_nonzero(where == FREE)), int(np.count_nonzero(where != UNKNOWN))
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.inverse_depth import chance_difference
 from duagc.pipeline.geometry.masks import Mask, large_regions
 from duagc.pipeline.geometry.projection import SAME_SURFACE
 from duagc.pipeline.kernels.free_space import free_space
@@ -70,9 +71,9 @@ def hidden_pixels(
     T_views_map = se3.inverse(np.reshape([T_map_view for _, T_map_view in seen], (-1, 4, 4)))
     views = [(level, T_view_map) for (level, _), T_view_map in zip(seen, T_views_map, strict=True)]
     some = (v % 2 == 0) & (u % 2 == 0)
-    votes = _votes(points_map[some], views, config)
+    votes = _votes(points_map[some], view.noise, views, config)
     if np.count_nonzero(votes.is_free) >= least / 8:  # half as many as of a region that is large enough
-        votes = _votes(points_map, views, config)
+        votes = _votes(points_map, view.noise, views, config)
     if np.count_nonzero(votes.is_free) < least:
         return HiddenPixels(np.zeros(view.inverse_depth.shape, bool), 0.0, votes.visible)
     is_free, is_surface = np.zeros(inverse_depth.shape, bool), np.zeros(inverse_depth.shape, bool)
@@ -106,8 +107,10 @@ class _Votes:
     visible: float
 
 
-def _votes(points_map: Array, views: Sequence[tuple[Level, Array]], config: FrontendConfig) -> _Votes:
-    """What earlier views, each with T_view_map [4, 4], say of points [n, 3] in the map, meters."""
+def _votes(
+    points_map: Array, noise: float, views: Sequence[tuple[Level, Array]], config: FrontendConfig
+) -> _Votes:
+    """What earlier views, each with T_view_map [4, 4], say of points [n, 3] in the map, meters; noise as of `Level`."""
     n = len(points_map)
     free, there, judged = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, bool)
     for level, T_view_map in views:
@@ -118,6 +121,7 @@ def _votes(points_map: Array, views: Sequence[tuple[Level, Array]], config: Fron
             level.camera,
             gate_m=config.tracking.registration.depth_gate_m,
             gate_relative=config.tracking.registration.depth_gate_relative,
+            gate_inverse=chance_difference(noise, level.noise),
         )
         free += where == FREE
         there += where == ON_SURFACE

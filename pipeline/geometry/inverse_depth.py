@@ -7,6 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.geometry.statistics import mad_sigma, median
+
+CHANCE_SIGMAS = 4.0  # by which two depths of one surface differ at most
+
 
 def inverse_or_zero(values: NDArray[Any]) -> NDArray[Any]:
     """One over each value, 0 where it is unknown; of the same type.
@@ -16,3 +20,43 @@ def inverse_or_zero(values: NDArray[Any]) -> NDArray[Any]:
     """
     known, one = values > 0, values.dtype.type(1)
     return np.where(known, one / np.where(known, values, one), values.dtype.type(0))
+
+
+def inverse_depth_noise(inverse_depth: NDArray[Any], sigma_m: NDArray[Any] | None = None) -> float:
+    """Standard deviation of the inverse depth of the farther half of the known pixels, 1/m; 0 where too few are known.
+
+    By its second differences along rows and columns, which are 0 on planes, or as stated, whichever is larger. It is
+    the farther half where noise is more than a few percent of the depth: by stereo it is the same in inverse depth
+    everywhere, of a time-of-flight camera it falls there.
+
+    Args:
+        inverse_depth: [h, w], 1/m, 0 = unknown.
+        sigma_m: [h, w], standard deviation of the depth where it is known, meters; None: not stated.
+    """
+    known = inverse_depth[inverse_depth > 0]
+    if not len(known):
+        return 0.0
+    half = median(known)
+    far = (inverse_depth > 0) & (inverse_depth <= half)
+    differences = np.concatenate(
+        [_second_differences(inverse_depth, far), _second_differences(inverse_depth.T, far.T)]
+    )
+    noise = mad_sigma(differences) / np.sqrt(6) if len(differences) else 0.0
+    stated = 0.0 if sigma_m is None else median((sigma_m * np.square(inverse_depth))[far])
+    return float(max(noise, stated))
+
+
+def _second_differences(inverse_depth: NDArray[Any], far: NDArray[np.bool_]) -> NDArray[Any]:
+    """Second differences [n] along rows, around pixels that are far and have known neighbors."""
+    before, after = inverse_depth[:, :-2], inverse_depth[:, 2:]
+    usable = far[:, 1:-1] & (before > 0) & (after > 0)
+    return (before - 2 * inverse_depth[:, 1:-1] + after)[usable]
+
+
+def chance_difference(*noise: float) -> float:
+    """By how much inverse depths of one surface differ at most by their noise, 1/m.
+
+    Args:
+        noise: standard deviation of each, 1/m.
+    """
+    return CHANCE_SIGMAS * float(np.sqrt(sum(sigma * sigma for sigma in noise)))

@@ -24,6 +24,7 @@ def free_space(
     *,
     gate_m: float,
     gate_relative: float,
+    gate_inverse: float,
     isa: str = "auto",
 ) -> NDArray[np.int8]:
     """`kernels.free_space_definition.free_space`.
@@ -35,13 +36,15 @@ def free_space(
         camera: of the view.
         gate_m: by which a point must differ from the measured depth not to be on the surface.
         gate_relative: the same as a share of the measured depth.
+        gate_inverse: the same of the inverse depth, 1/m.
         isa: instruction set, as of `Rasterizer`.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points have shape {points.shape}, expected (n, 3)")
     where = np.empty(len(points), dtype=np.int8)
     image = floats_of("nearest", nearest, (camera.height, camera.width))
-    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, NEAR_M, NEAR_GATE, gate_m, gate_relative]
+    gates = [NEAR_GATE, gate_m, gate_relative, gate_inverse]
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, NEAR_M, *gates]
     _raster.free_space(
         isa,
         np.ascontiguousarray(points, dtype=np.float64),

@@ -23,6 +23,7 @@ def free_space(
     *,
     gate_m: float,
     gate_relative: float,
+    gate_inverse: float,
 ) -> NDArray[np.int8]:
     """Where points are, as far as a view can judge it: in space that it saw to be free, on a surface, or hidden.
 
@@ -35,7 +36,8 @@ def free_space(
         camera: of the view.
         gate_m: a point must differ by this from the measured depth not to be on the surface; less of surfaces that
             are so near that it is more than a quarter of their depth.
-        gate_relative: the same as a share of the measured depth; the larger limit holds.
+        gate_relative: the same as a share of the measured depth.
+        gate_inverse: the same of the inverse depth, 1/m; the largest of the three holds.
 
     Returns:
         For each point FREE, ON_SURFACE or HIDDEN; UNKNOWN where the view measured nothing.
@@ -48,8 +50,12 @@ def free_space(
     index, inverse = index[inverse > 0], inverse[inverse > 0]
     z_view, z_point = 1 / inverse.astype(np.float64), points_view[index, 2]
     gate = np.maximum(np.minimum(gate_m, NEAR_GATE * z_view), gate_relative * z_view)
-    where = np.full(len(points), UNKNOWN, np.int8)
-    where[index] = np.where(
-        z_point < z_view - gate, FREE, np.where(z_point > z_view + gate, HIDDEN, ON_SURFACE)
+    known = inverse.astype(np.float64)
+    nearest_m = np.minimum(z_view - gate, 1 / (known + gate_inverse))
+    farther = known > gate_inverse
+    farthest_m = np.maximum(
+        z_view + gate, np.where(farther, 1 / np.where(farther, known - gate_inverse, 1), np.inf)
     )
+    where = np.full(len(points), UNKNOWN, np.int8)
+    where[index] = np.where(z_point < nearest_m, FREE, np.where(z_point > farthest_m, HIDDEN, ON_SURFACE))
     return where

@@ -18,9 +18,9 @@ from duagc.pipeline.base.shelf import SHELF
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.inverse_depth import inverse_or_zero
+from duagc.pipeline.geometry.inverse_depth import chance_difference, inverse_or_zero
 from duagc.pipeline.geometry.masks import large_regions
-from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
+from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.kernels.free_space import free_space
 from duagc.pipeline.kernels.free_space_definition import FREE, ON_SURFACE
 from duagc.pipeline.registration.pyramid import Level
@@ -34,6 +34,7 @@ class _View:
     T_map_camera: Array
     inverse_depth: Image
     nearest: Image  # largest inverse depth of 3x3 pixels
+    noise: float  # standard deviation of the inverse depth of what is far, 1/m
     center_map: Array
 
 
@@ -90,6 +91,7 @@ class FreeSpace:
                 self._small,
                 gate_m=self.config.gate_m,
                 gate_relative=self.config.gate_relative,
+                gate_inverse=chance_difference(view.noise, other.noise),
             )
             through += where == FREE
             there += where == ON_SURFACE
@@ -141,7 +143,7 @@ class FreeSpace:
         if len(v):
             center = np.median(back_project(self._small, u, v, 1 / small[v, u].astype(np.float64)), axis=0)
         T = np.array(T_map_camera, dtype=np.float64)
-        return _View(T, small, largest_of_3x3(small), se3.transform(T, center[None])[0])
+        return _View(T, small, level.nearest, level.noise, se3.transform(T, center[None])[0])
 
     def _nearest(self, view: _View) -> list[_View]:
         """The views that look at the nearest places, itself excepted."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.inverse_depth import inverse_depth_noise
 from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
 from duagc.pipeline.geometry.scattered_holes import without_scattered_holes
 from duagc.pipeline.kernels import pyramid as compiled
@@ -79,6 +80,11 @@ class Level:
     def nearest(self) -> Image:
         """Largest inverse depth [h, w] in the 3x3 pixels around every pixel, 1/m, 0 where none is known."""
         return largest_of_3x3(self.inverse_depth)
+
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of the inverse depth of what is far, 1/m."""
+        return inverse_depth_noise(self.inverse_depth, self.depth_sigma_m)
 
     @cached_property
     def normals(self) -> Image:

@@ -23,6 +23,7 @@ from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.registration import Level, Registration
 from tests.fixtures.films import CAMERA, FRAMES, filmed
 from tests.frontend.conftest import CONFIG, STARTS
@@ -109,6 +110,33 @@ def test_a_surface_is_an_object_as_a_whole_where_enough_of_it_is_in_free_space()
     assert hidden.share == pytest.approx(120 / (h * w))
     still = hidden_pixels(before, np.eye(4), [(level(wall), np.eye(4))] * 2, CONFIG)
     assert not still.mask.any()
+
+
+def stereo_street(rng: np.random.Generator, behind_m: float = 0.0, thing_m: float | None = None) -> Level:
+    """A ground 1.2 m below a stereo camera that is some way behind, a wall 14 m ahead, and a thing before it."""
+    camera = PinholeCamera(320, 240, 228.0, 228.0, 159.5, 119.5)
+    ray = (np.arange(camera.height) - camera.cy) / camera.fy
+    inverse = np.repeat(np.maximum(ray / 1.2, 1 / (14.0 + behind_m))[:, None], camera.width, axis=1)
+    if thing_m is not None:
+        inverse[60:180, 100:220] = np.maximum(inverse[60:180, 100:220], 1 / thing_m)
+    noise = cv2.GaussianBlur(rng.standard_normal(inverse.shape), (0, 0), 1.0)
+    noisy = (inverse + 5.5e-3 * noise / noise.std()).astype(np.float32)
+    found = Level(camera, np.zeros_like(noisy), np.where(noisy > 1 / 30, noisy, np.float32(0)))
+    for _ in range(3):
+        found = found.halved()
+    return found
+
+
+def test_noise_of_far_surfaces_is_no_object_and_an_object_before_them_is_found() -> None:
+    """Depth that is wrong by a tenth passes a gate of 5 %: half of a street seemed to be an object before it."""
+    rng, seen = np.random.default_rng(2), []
+    for k in range(1, 17):
+        back = se3.exp(np.array([0, 0, -0.5 * k, 2e-3 * k / 16, 0, 0]))  # as tracking drifts
+        seen.append((stereo_street(rng, behind_m=0.5 * k), back))
+    for _ in range(3):
+        assert hidden_pixels(stereo_street(rng), np.eye(4), seen, CONFIG).share == 0.0
+        there = hidden_pixels(stereo_street(rng, thing_m=5.0), np.eye(4), seen, CONFIG)
+        assert there.share == pytest.approx(0.2, abs=0.02)
 
 
 def test_an_object_is_carried_into_the_next_view_until_it_is_gone() -> None:

@@ -16,7 +16,7 @@ MOTIONS = {
     "back": np.array([0.0, 0.0, 2.5, 0.0, 0.0, 0.0]),
     "turned away": np.array([0.1, 0.0, 0.0, 0.0, 2.5, 0.0]),
 }
-GATES = {"gate_m": 0.15, "gate_relative": 0.1}
+GATES = {"gate_m": 0.15, "gate_relative": 0.1, "gate_inverse": 0.0}
 
 
 def wall(z: float) -> np.ndarray:
@@ -31,7 +31,8 @@ def points_of(depth_m: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("isa", available_isas())
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("size", SIZES)
-def test_places_are_those_of_the_definition(size: str, motion: str, isa: str) -> None:
+@pytest.mark.parametrize("gate_inverse", [0.0, 0.02, 1.5])
+def test_places_are_those_of_the_definition(gate_inverse: float, size: str, motion: str, isa: str) -> None:
     camera, T = camera_of(*SIZES[size]), se3.exp(MOTIONS[motion])
     nearest = projection.largest_of_3x3(surfaces(camera, holes=0.6).astype(np.float32))
     v, u = np.nonzero(nearest)
@@ -39,11 +40,12 @@ def test_places_are_those_of_the_definition(size: str, motion: str, isa: str) ->
     points = projection.back_project(camera, u, v, share / nearest[v, u])
     strange = [[0, 0, 0.05], [0, 0, -1], [np.nan, 0, 1], [0, 0, np.nan], [1e300, 0, 1], [0, -np.inf, 1]]
     points = np.concatenate([points, strange])
-    found = free_space(points, T, nearest, camera, **GATES, isa=isa)
+    gates = GATES | {"gate_inverse": gate_inverse}
+    found = free_space(points, T, nearest, camera, **gates, isa=isa)
     with np.errstate(invalid="ignore", over="ignore"):
-        wanted = free_space_definition.free_space(points, T, nearest, camera, **GATES)
+        wanted = free_space_definition.free_space(points, T, nearest, camera, **gates)
     np.testing.assert_array_equal(found, wanted)
-    if size == "wide" and motion == "usual":
+    if size == "wide" and motion == "usual" and gate_inverse < 1:
         assert set(wanted) == {FREE, ON_SURFACE, HIDDEN, UNKNOWN}
 
 
@@ -53,6 +55,22 @@ def test_what_stands_before_a_surface_is_in_free_space_however_near_it_is(z: flo
     nearest = projection.largest_of_3x3(1 / wall(z))
     for share, expected in ((0.6, FREE), (1.0, ON_SURFACE), (1.4, HIDDEN)):
         assert (free_space(points_of(wall(share * z)), np.eye(4), nearest, CAMERA, **GATES) == expected).all()
+
+
+def test_a_gate_of_the_inverse_depth_grows_with_the_square_of_the_depth() -> None:
+    gates = GATES | {"gate_inverse": 0.02}
+    for z, nearest_m, farthest_m in ((2.0, 1.8, 2.2), (10.0, 8.34, 12.49), (60.0, 27.27, np.inf)):
+        nearest = projection.largest_of_3x3(1 / wall(z))
+        for depth, expected in (
+            (nearest_m - 0.1, FREE),
+            (nearest_m + 0.1, ON_SURFACE),
+            (min(farthest_m - 0.1, 900), ON_SURFACE),
+        ):
+            assert (free_space(points_of(wall(depth)), np.eye(4), nearest, CAMERA, **gates) == expected).all()
+        if np.isfinite(farthest_m):
+            assert (
+                free_space(points_of(wall(farthest_m + 0.1)), np.eye(4), nearest, CAMERA, **gates) == HIDDEN
+            ).all()
 
 
 def test_points_before_a_wall_are_in_free_space_and_those_behind_it_hidden() -> None:

@@ -24,9 +24,11 @@ NO_INLINE static void free_space(const JudgedPoints& of, int8_t* __restrict wher
         if (!(is_inside(u, of.width) & is_inside(v, of.height))) continue;
         const float inverse = of.nearest[static_cast<size_t>(v) * static_cast<size_t>(of.width) + static_cast<size_t>(u)];
         if (!(inverse > 0.0f)) continue;
-        const double seen = 1.0 / static_cast<double>(inverse), near_gate = of.near_gate * seen, gate_far = of.gate_relative * seen;
+        const double known = static_cast<double>(inverse), seen = 1.0 / known, near_gate = of.near_gate * seen, gate_far = of.gate_relative * seen;
         const double gate_near = of.gate_m < near_gate ? of.gate_m : near_gate, gate = gate_near > gate_far ? gate_near : gate_far;
-        where[i] = depth < seen - gate ? PLACE_FREE : (depth > seen + gate ? PLACE_HIDDEN : PLACE_ON_SURFACE);
+        const double least = 1.0 / (known + of.gate_inverse), most = known > of.gate_inverse ? 1.0 / (known - of.gate_inverse) : INFINITY;
+        const double nearest = least < seen - gate ? least : seen - gate, farthest = most > seen + gate ? most : seen + gate;
+        where[i] = depth < nearest ? PLACE_FREE : (depth > farthest ? PLACE_HIDDEN : PLACE_ON_SURFACE);
     }
 }
 

@@ -129,7 +129,7 @@ struct JudgedPoints {
     size_t count;
     int width, height;
     PinholeNumbers camera;
-    double near_m, near_gate, gate_m, gate_relative;
+    double near_m, near_gate, gate_m, gate_relative, gate_inverse;
     const double* points;         // [n, 3]
     const double* T_view_points;  // [3, 4]
     const float* nearest;         // [h, w], 1/m, 0 = unknown

@@ -173,12 +173,13 @@ static void displace_depth(const std::string& isa, const DoubleInputs& depth, co
     kernels->displace_depth(of, memory.data(), memory.data() + depth.shape(1), displaced.data());
 }
 
-// numbers: fx, fy, cx, cy; least depth, largest share of the depth of a gate in meters, that gate, a gate as a share of the depth.
+// numbers: fx, fy, cx, cy; least depth, largest share of the depth of a gate in meters, that gate, a gate as a share of the depth,
+// one of the inverse depth.
 static void free_space(const std::string& isa, const DoubleInputs& points, const DoubleInputs& T_view_points, const Inputs& nearest,
                        const DoubleInputs& numbers, const Array<int8_t>& where) {
     const double* n = numbers.data();
     const JudgedPoints of = {points.shape(0), static_cast<int>(nearest.shape(1)), static_cast<int>(nearest.shape(0)), {n[0], n[1], n[2], n[3]},
-                             n[4], n[5], n[6], n[7], points.data(), T_view_points.data(), nearest.data()};
+                             n[4], n[5], n[6], n[7], n[8], points.data(), T_view_points.data(), nearest.data()};
     const RegistrationKernels* kernels = kernels_named(isa)->registration;
     const nb::gil_scoped_release unlocked;
     kernels->free_space(of, where.data());
