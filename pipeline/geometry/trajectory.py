@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.base.arrays import Array, rows_not_finite
+from duagc.pipeline.base.decimal_seconds import nanoseconds_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file, read_text
 from duagc.pipeline.geometry import se3, so3
@@ -73,7 +74,7 @@ def read_tum(path: str | Path) -> Trajectory:
             continue
         try:
             row = [float(f) for f in fields[1:]]
-            stamp = np.int64(_nanoseconds(fields[0]))
+            stamp = nanoseconds_of(fields[0])
         except (ValueError, OverflowError):
             row = []
         if len(row) != 7 or not np.all(np.isfinite(row)):
@@ -90,15 +91,6 @@ def read_tum(path: str | Path) -> Trajectory:
     # files of motion capture repeat times, and some go back: of one time the last pose counts, as for the TUM tools
     times, last = np.unique(np.array(stamps, dtype=np.int64)[::-1], return_index=True)
     return Trajectory(times, poses[::-1][last])
-
-
-def _nanoseconds(text: str) -> int:
-    """Seconds written as a decimal, in integer nanoseconds, without passing through a float where possible."""
-    if "e" in text.lower():
-        return round(float(text) * 1e9)
-    whole, _, fraction = text.partition(".")
-    sign = -1 if whole.startswith("-") else 1
-    return int(whole or "0") * 10**9 + sign * int((fraction + "000000000")[:9])
 
 
 def associate(a: Trajectory, b: Trajectory, tolerance_ns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -29,6 +29,14 @@ def test_tum_files_keep_nanoseconds_and_poses(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["t.tum"]
 
 
+def test_times_with_an_exponent_keep_nanoseconds(tmp_path: Path) -> None:
+    """As numpy.savetxt writes them."""
+    path = tmp_path / "t.tum"
+    path.write_text("1.305031102175304123e+09 1 2 3 0 0 0 1\n1305031103.175304123 1 2 3 0 0 0 1\n")
+    stamps_ns = [1_305_031_102_175_304_123, 1_305_031_103_175_304_123]
+    assert trajectory.read_tum(path).stamps_ns.tolist() == stamps_ns
+
+
 @pytest.mark.parametrize(
     "line",
     [
