@@ -176,10 +176,17 @@ class RecordingWriter:
         if not self._robots:
             raise DuagError(f"{self.out}: found no robot, expected at least one")
         for robot, row in self.checks.items():
-            if isinstance(row, Mapping) and row.get("rough"):
+            if not isinstance(row, Mapping):
+                continue
+            if row.get("rough"):
                 self.warnings.append(
                     f"{robot}: depth moved by its true poses differs by {row['reprojection_median_m']:.3f} m at "
                     f"{row['median_depth_m']:.2f} m (medians), far less than without a motion: poses or depth are rough"
+                )
+            if "apart_m" in row:
+                self.warnings.append(
+                    f"{robot}: by its true poses, images that were compared are {row['apart_m']:.3g} m apart and show "
+                    "too little of each other: whether poses (meters?), depth and intrinsics fit is not known"
                 )
         self.warnings += [
             f"{other}: {same} of its color images are those of {robot}, byte for byte: what one camera saw once would "

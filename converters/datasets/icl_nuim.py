@@ -21,6 +21,7 @@ from duagc.converters.layouts.tum_layout import Poses
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.messages.parts import NANOSECONDS
 
 DEPTH_SCALE = 1 / 5000
 CAMERA = PinholeCamera(640, 480, 481.20, 480.00, 319.50, 239.50)
@@ -57,7 +58,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     poses, path = _read_poses(src)
     shift = _shift(images, poses, settings, path)
     numbers = settings.first(sorted(images))
-    stamps = stamps_of(numbers, settings.rate_hz)
+    stamps = stamps_of(numbers, settings.rate_hz, str(src))
     frames = [
         FrameFiles(n, stamp, images[n][1], images[n][0], poses.get(n + shift))
         for n, stamp in zip(numbers, stamps, strict=True)
@@ -82,6 +83,8 @@ def _read_associations(path: Path) -> dict[int, tuple[Path, Path]]:
             raise DuagError(
                 f"{path}:{number}: {line.strip()[:60]!r}, expected number and file of depth, then of color"
             )
+        if int(words[2]) in images:
+            raise DuagError(f"{path}:{number}: found image {int(words[2])} again, expected every image once")
         images[int(words[2])] = path.parent / words[1], path.parent / words[3]
     if not images:
         raise DuagError(f"{path}: lists no image, expected number and file of depth, then of color")
@@ -94,7 +97,11 @@ def _read_poses(src: Path) -> tuple[dict[int, np.ndarray], Path]:
     if len(found) != 1:
         raise DuagError(f"{src}: found {len(found)} files *.gt.freiburg, expected one")
     poses = Poses.read(found[0])
-    numbers = (poses.stamps_ns // 1_000_000_000).tolist()
+    numbers = (poses.stamps_ns // NANOSECONDS).tolist()
+    if len(again := set(numbers)) < len(numbers):
+        raise DuagError(
+            f"{found[0]}: {len(numbers)} poses have {len(again)} numbers, expected whole numbers of images, not times"
+        )
     return dict(zip(numbers, S @ poses.T_world_body @ S, strict=True)), found[0]
 
 

@@ -6,14 +6,16 @@ SRC is a scene, for example `Replica/room0`; `cam_params.json` lies next to it. 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from duagc.converters.layouts import image_folder, replica_layout
 from duagc.converters.layouts.image_files import options_of
+from duagc.converters.layouts.sound_camera import check_camera
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import read_json
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 
@@ -48,12 +50,16 @@ def _read_camera(src: Path) -> tuple[PinholeCamera, float]:
     if path is None:
         raise DuagError(f"{src.parent / 'cam_params.json'}: not found, expected the camera of the renders")
     try:
-        c = json.loads(read_text(path, "the camera of the renders"))["camera"]
+        c = read_json(path, "the camera of the renders")["camera"]
         camera = PinholeCamera(
             int(c["w"]), int(c["h"]), *(float(c[name]) for name in ("fx", "fy", "cx", "cy"))
         )
-        return camera, 1.0 / float(c["scale"])
+        depth_scale = 1.0 / float(c["scale"])
     except (ValueError, TypeError, KeyError, ArithmeticError) as error:
         raise DuagError(
             f"{path}: {type(error).__name__} {error}, expected camera with w, h, fx, fy, cx, cy, scale"
         ) from error
+    check_camera(camera, str(path))
+    if not 0 < depth_scale < np.inf:
+        raise DuagError(f"{path}: scale is {c['scale']}, expected a positive number of units per meter")
+    return camera, depth_scale

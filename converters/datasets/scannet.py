@@ -14,8 +14,9 @@ import numpy as np
 from pydantic import Field
 
 from duagc.converters.layouts import image_folder
-from duagc.converters.layouts.image_files import options_of, rigid
+from duagc.converters.layouts.image_files import add_numbered, options_of, rigid
 from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of
+from duagc.converters.layouts.sound_camera import check_camera
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, read_bytes, read_text
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -59,7 +60,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     color_camera = _camera(root / "intrinsic" / "intrinsic_color.txt", color[numbers[0]])
     frames = [
         FrameFiles(n, stamp, color[n], depth[n], _read_pose(pose[n]) if n in pose else None)
-        for n, stamp in zip(numbers, stamps_of(numbers, settings.rate_hz), strict=True)
+        for n, stamp in zip(numbers, stamps_of(numbers, settings.rate_hz, str(root)), strict=True)
     ]
     clip = Clip("", frames, camera, DEPTH_SCALE, color_camera=color_camera)
     image_folder.write_parts(
@@ -72,7 +73,11 @@ def _numbered(folder: Path) -> dict[int, Path]:
         raise DuagError(
             f"{folder}: no such folder, expected files named by number, as SensReader/python of ScanNet exports a .sens"
         )
-    return {int(p.stem): p for p in sorted(folder.iterdir()) if p.stem.isdecimal()}
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.stem.isdecimal():
+            add_numbered(found, int(path.stem), path)
+    return found
 
 
 def _camera(path: Path, image: Path) -> PinholeCamera:
@@ -92,7 +97,9 @@ def _camera(path: Path, image: Path) -> PinholeCamera:
         raise DuagError(
             f"{path}: center {K[0, 2]:g}, {K[1, 2]:g} px, expected that of images of {width}x{height}, as {image.name}"
         )
-    return PinholeCamera(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    camera = PinholeCamera(width, height, *(float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))))
+    check_camera(camera, str(path))
+    return camera
 
 
 def _read_pose(path: Path) -> np.ndarray | None:

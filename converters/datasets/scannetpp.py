@@ -7,7 +7,7 @@ camera to world with OpenGL axes. Photographs are not a video: consecutive ones 
 
 from __future__ import annotations
 
-import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,9 @@ from pydantic import Field
 from duagc.converters.layouts import image_folder
 from duagc.converters.layouts.image_files import options_of, rigid
 from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of
+from duagc.converters.layouts.sound_camera import check_camera
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import read_json
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 0.001
@@ -50,7 +51,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     settings = options_of(Options, options, "scannetpp")
     path = src / "dslr" / "nerfstudio" / "transforms_undistorted.json"
     try:
-        content = json.loads(read_text(path, "cameras and poses of ScanNet++"))
+        content = read_json(path, "cameras and poses of ScanNet++")
         size = int(content["w"]), int(content["h"])
         camera = PinholeCamera(
             *size,
@@ -73,12 +74,17 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         raise DuagError(
             f"{path}: {type(error).__name__} {error}, expected w, h, fl_x, fl_y, cx, cy and frames"
         ) from error
+    check_camera(camera, str(path))
+    names = Counter(Path(name).name for name, _, _ in entries)  # that of their files here
+    for name, count in names.items():
+        if count > 1:
+            raise DuagError(f"{path}: found {name} {count} times, expected every image once")
     taken = [e for e in entries if settings.bad or not e[2]]
     if not taken:
         raise DuagError(f"{path}: names no usable image, expected frames")
     bad = len(entries) - len(taken)
     taken = settings.first(taken)
-    stamps = stamps_of(range(len(taken)), settings.rate_hz)
+    stamps = stamps_of(range(len(taken)), settings.rate_hz, str(path))
     frames = [
         FrameFiles(
             number,

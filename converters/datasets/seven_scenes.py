@@ -20,7 +20,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from duagc.converters.layouts import reference_poses
 from duagc.converters.layouts.calibrated import correct, is_pinhole, numbers, square_camera
-from duagc.converters.layouts.image_files import kept_color, options_of, read_depth, rigid
+from duagc.converters.layouts.image_files import add_numbered, kept_color, options_of, read_depth, rigid
 from duagc.converters.layouts.image_folder import LengthOptions
 from duagc.converters.layouts.self_check import ReprojectionCheck
 from duagc.converters.robot_writer import RobotWriter
@@ -218,9 +218,10 @@ def _parts(
 def _sequence_folders(src: Path, options: Options) -> list[Path]:
     if not src.is_dir():
         raise DuagError(f"{src}: no such folder, expected a sequence of 7-Scenes")
-    found = {
-        int(m[1]): p for p in sorted(src.iterdir()) if (m := SEQUENCE_FOLDER.fullmatch(p.name)) and p.is_dir()
-    }
+    found: dict[int, Path] = {}
+    for path in sorted(src.iterdir()):
+        if (match := SEQUENCE_FOLDER.fullmatch(path.name)) and path.is_dir():
+            add_numbered(found, int(match[1]), path)
     if not options.sequences:
         return [found[n] for n in sorted(found)] or [src]
     wanted = [text.strip() for text in options.sequences.split(",")]
@@ -243,9 +244,7 @@ def list_frames(folder: Path) -> tuple[list[SevenScenesFrame], list[int]]:
     for path in sorted(folder.iterdir()):
         match = FRAME_FILE.fullmatch(path.name)
         if match and (match[2] == "pose") == (match[3] == "txt"):
-            other = files[match[2]].setdefault(int(match[1]), path)
-            if other != path:
-                raise DuagError(f"{path}: found together with {other.name}, expected one of them")
+            add_numbered(files[match[2]], int(match[1]), path)
     numbers = sorted(set().union(*files.values()))
     if not numbers:
         raise DuagError(f"{folder}: found no frame-NNNNNN.color.png or .jpg, expected a sequence of 7-Scenes")

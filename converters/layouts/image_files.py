@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from duagc.converters.layouts.ros_images import encoded_size
@@ -19,6 +19,7 @@ from duagc.pipeline.recording.greatest_depth import without_saturated
 
 COLOR = "a color image"
 PNG, JPEG = b"\x89PNG", b"\xff\xd8\xff"  # the first bytes
+FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
 MAX_ROTATION_DEFECT = 0.01  # largest entry of |R - nearest rotation|
 Options = TypeVar("Options", bound=Config)
 
@@ -45,6 +46,22 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
         if not first["loc"]:  # of several options together
             raise DuagError(f"{dataset}: {first['ctx']['error']}") from error
         raise DuagError(f"{dataset}: {name} = {first['input']!r}: {expected_of(first)}") from error
+
+
+def add_numbered(found: dict[int, Path], number: int, path: Path) -> None:
+    """Add a file or folder by its number.
+
+    Args:
+        found: by number; gets the new one.
+        number: of the new one.
+        path: of the new one.
+
+    Raises:
+        DuagError: another has that number, as `1.jpg` and `00001.jpg` have.
+    """
+    other = found.setdefault(number, path)
+    if other != path:
+        raise DuagError(f"{path}: found together with {other.name}, expected one of them")
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -160,7 +177,7 @@ def rigid(T: NDArray[np.float64], where: str) -> NDArray[np.float64]:
         where: begins the line of an error.
 
     Raises:
-        DuagError: `where` holds something that is no rigid motion.
+        DuagError: `where` holds something that is no rigid motion, or goes beyond `FAR_M`.
     """
     if T.shape != (4, 4):
         raise DuagError(f"{where}: is a matrix {T.shape}, expected (4, 4)")
@@ -172,4 +189,20 @@ def rigid(T: NDArray[np.float64], where: str) -> NDArray[np.float64]:
         raise DuagError(
             f"{where}: its rotation is off by {defect:.2g}, expected a rigid motion (within {MAX_ROTATION_DEFECT})"
         )
+    check_near(T[:3, 3], where)
     return se3.from_rotation_translation(R, T[:3, 3])
+
+
+def check_near(position_m: ArrayLike, where: str) -> None:
+    """Refuse a position beyond `FAR_M`.
+
+    Args:
+        position_m: [3], meters.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: it is as far away.
+    """
+    far_m = float(np.abs(position_m).max())
+    if not far_m < FAR_M:
+        raise DuagError(f"{where}: is {far_m:.3g} m away, expected less than {FAR_M:.0e} m")

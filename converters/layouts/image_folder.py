@@ -35,6 +35,7 @@ from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.greatest_depth import unmeasured
 
 Item = TypeVar("Item")
+LAST_NS = 1 << 62  # about the year 2116
 LOOKED_AT, LOOKED_AT_EVERY = 8, 8  # depth images, the first of a robot, and how far apart
 
 
@@ -116,14 +117,21 @@ class Clip:
         return [replace(self, frames=self.frames[a:b]) for a, b in pairwise(cuts)]
 
 
-def stamps_of(numbers: Sequence[int], rate_hz: int) -> list[int]:
+def stamps_of(numbers: Sequence[int], rate_hz: int, where: str = "the dataset") -> list[int]:
     """Times (ns) of frames of a dataset that has none, from their numbers.
 
     Args:
         numbers: of the frames; number 0 is at time 0.
         rate_hz: frames per second.
+        where: begins the line of an error.
+
+    Raises:
+        DuagError: a number is so large that no time is.
     """
-    return [number * NANOSECONDS // rate_hz for number in numbers]
+    stamps = [number * NANOSECONDS // rate_hz for number in numbers]
+    if max(stamps, default=0) >= LAST_NS:
+        raise DuagError(f"{where}: frame {max(numbers)} at {rate_hz} Hz, expected one within 146 years")
+    return stamps
 
 
 def write_parts(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from duagc.converters.layouts.image_files import options_of, rigid
+from duagc.converters.layouts.image_files import add_numbered, options_of, rigid
 from duagc.converters.layouts.image_folder import Clip, FrameFiles, LengthOptions, stamps_of, write
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
@@ -80,7 +80,10 @@ def convert_team(
     part, camera = dataset.folder, dataset.camera
     if not src.is_dir():
         raise DuagError(f"{src}: no such folder, expected folders {part.pattern} in it")
-    folders = {int(m[1]): p for p in sorted(src.iterdir()) if (m := part.fullmatch(p.name)) and p.is_dir()}
+    folders: dict[int, Path] = {}
+    for folder in sorted(src.iterdir()):
+        if (match := part.fullmatch(folder.name)) and folder.is_dir():
+            add_numbered(folders, int(match[1]), folder)
     if robots != len(folders):
         raise DuagError(
             f"{src}: found {len(folders)} folders {part.pattern} for {robots} robots, "
@@ -137,7 +140,7 @@ def read_part(
     files: dict[str, dict[int, Path]] = {"frame": {}, "depth": {}}
     for file in sorted(results.iterdir()):
         if match := FILE.fullmatch(file.name):
-            files[match[1]][int(match[2])] = file
+            add_numbered(files[match[1]], int(match[2]), file)
     color, depth = files["frame"], files["depth"]
     for number in sorted(set(color) ^ set(depth)):
         there, kind = (color[number], "depth") if number in color else (depth[number], "frame")
@@ -153,7 +156,7 @@ def read_part(
     if len(poses) != numbers[-1] + 1:
         warnings.append(f"{label or folder.name}: {len(poses)} poses for frames up to {numbers[-1]}")
     numbers = options.first(numbers)
-    stamps = stamps_of(numbers, options.rate_hz)
+    stamps = stamps_of(numbers, options.rate_hz, str(results))
     frames = [
         FrameFiles(n, stamp, color[n], depth[n], poses[n]) for n, stamp in zip(numbers, stamps, strict=True)
     ]

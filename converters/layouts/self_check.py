@@ -44,6 +44,7 @@ class ReprojectionCheck:
         self._depths: list[NDArray[np.float64]] = []
         self._noise: list[NDArray[np.float64]] = []
         self._stated: list[NDArray[np.float64]] = []
+        self._apart_m: list[float] = []  # of the places of pairs with depth
 
     def needs(self, index: int, T_world_camera: NDArray[np.float64] | None) -> bool:
         """Whether a frame is compared with another.
@@ -87,7 +88,10 @@ class ReprojectionCheck:
         T_world_second: NDArray[np.float64],
     ) -> None:
         points = self._camera.back_project(first)[::STRIDE, ::STRIDE].reshape(-1, 3)
-        points = se3.transform(se3.inverse(T_world_second) @ T_world_first, points[points[:, 2] > 0])
+        T_second_first = se3.inverse(T_world_second) @ T_world_first
+        points = se3.transform(T_second_first, points[points[:, 2] > 0])
+        if len(points) >= MIN_PIXELS <= int(np.count_nonzero(second)):
+            self._apart_m.append(float(np.linalg.norm(T_second_first[:3, 3])))
         index, u, v = visible(self._camera, points)
         found, expected = second[v, u], points[index, 2]
         self._residuals.append(np.abs(found - expected)[found > 0])
@@ -99,6 +103,8 @@ class ReprojectionCheck:
     def result(self, label: str, max_ratio: float = MAX_RATIO) -> dict[str, Any]:
         """Median residual and median depth in meters, None where too little overlaps; and whether poses are rough.
 
+        Where images with depth show too little of each other, "apart_m" says how far they are apart (median).
+
         Args:
             label: of the source, for the message.
             max_ratio: largest residual as a share of the depth; more where the true poses are known to be
@@ -109,7 +115,8 @@ class ReprojectionCheck:
         """
         residuals = np.concatenate([*self._residuals, np.zeros(0)])
         if len(residuals) < MIN_PIXELS:
-            return {"reprojection_median_m": None, "median_depth_m": None}
+            apart = {"apart_m": float(np.median(self._apart_m))} if self._apart_m else {}
+            return {"reprojection_median_m": None, "median_depth_m": None, **apart}
         residual, depth = float(np.median(residuals)), float(np.median(np.concatenate(self._depths)))
         found: dict[str, Any] = {"reprojection_median_m": residual, "median_depth_m": depth}
         if residual <= max_ratio * depth:

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from duagc.converters.layouts.image_files import JPEG, PNG, rigid
 from duagc.converters.layouts.ros_images import encoded_size
-from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 
-FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
 FIRST_BYTES = {"png": PNG, "jpeg": JPEG}
 
 
@@ -72,7 +70,7 @@ def check_sigma(sigma_m: NDArray[np.floating], depth: NDArray[np.uint16], where:
 
 
 def check_pose(T: NDArray[np.float64], where: str) -> None:
-    """Refuse a pose that is no rigid motion, or beyond `FAR_M`.
+    """Refuse a pose that is no rigid motion, or too far away.
 
     Args:
         T: of a camera [4, 4].
@@ -81,6 +79,3 @@ def check_pose(T: NDArray[np.float64], where: str) -> None:
         DuagError: it is.
     """
     rigid(T, where)
-    far_m = float(np.abs(T[:3, 3]).max())
-    if not far_m < FAR_M:
-        raise DuagError(f"{where} is {far_m:.3g} m away, expected less than {FAR_M:.0e} m")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, Self
@@ -14,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from duagc.converters.layouts.image_folder import FrameFiles, LengthOptions
+from duagc.converters.layouts.image_files import check_near
+from duagc.converters.layouts.image_folder import LAST_NS, FrameFiles, LengthOptions
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.decimal_seconds import nanoseconds_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.pairing import TOLERANCE_KEY, TOLERANCE_NS, nearest_indices
-
-LAST_NS = 1 << 62  # about the year 2116
 
 
 class AssociationOptions(Config):
@@ -90,11 +89,13 @@ def nanoseconds(text: str, where: str) -> int:
         DuagError: it is no number, or a time after 2115.
     """
     try:
-        time_ns = Decimal(text) * NANOSECONDS
-        if abs(time_ns) < LAST_NS:
-            return int(time_ns.to_integral_value())
-    except (InvalidOperation, ValueError) as error:
-        raise DuagError(f"{where}: {text!r}, expected a time in seconds") from error
+        time_ns = nanoseconds_of(text)
+    except ValueError as error:
+        raise DuagError(f"{where}: {text[:60]!r}, expected a time in seconds") from error
+    except OverflowError:
+        time_ns = LAST_NS
+    if abs(time_ns) < LAST_NS:
+        return time_ns
     raise DuagError(f"{where}: {text[:60]!r}, expected a time in seconds before the year 2116")
 
 
@@ -187,10 +188,10 @@ class Poses:
         """From lines `timestamp tx ty tz qx qy qz qw`, also with commas; those with nan are only counted.
 
         Args:
-            path: of the file; times in seconds, positions in meters.
+            path: of the file; times in seconds, positions in meters. Of one time the last pose counts.
 
         Raises:
-            DuagError: a line is not eight numbers, or there is no pose.
+            DuagError: a line is not eight numbers, is too far away, or there is no pose.
         """
         rows: dict[int, list[float]] = {}
         unusable = 0
@@ -208,7 +209,8 @@ class Poses:
                     f"{where}: {line.strip()[:60]!r}, expected eight numbers: time (s) x y z qx qy qz qw"
                 )
             if np.all(np.isfinite(values)) and np.linalg.norm(values[3:]) > 0.5:
-                rows.setdefault(nanoseconds(words[0], where), values)
+                check_near(values[:3], where)
+                rows[nanoseconds(words[0], where)] = values
             else:
                 unusable += 1
         if not rows:
