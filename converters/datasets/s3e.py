@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from duagc.converters.layouts.derived_depth import (
@@ -30,6 +31,7 @@ from duagc.converters.layouts.derived_depth import (
     spread,
 )
 from duagc.converters.layouts.image_files import options_of
+from duagc.converters.layouts.ros_images import UnusableImage
 from duagc.converters.layouts.ros_points import VELODYNE
 from duagc.converters.layouts.s3e_layout import Fixes, S3eCalibration, read_fixes
 from duagc.converters.layouts.stereo import StereoOptions, StereoRig
@@ -37,6 +39,7 @@ from duagc.converters.logs import open_log
 from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.gather import gathered, nearest
+from duagc.converters.logs.stamps import sound_stamps
 from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
@@ -167,6 +170,11 @@ class _Vehicle:
         self.lidar = LidarSource(T_camera_left @ c.T_left_lidar, settings.range_sigma_m, motion, VELODYNE)
         self.groups = self._groups()
         self.truth = self._truth(fixes, origin)
+        images = [group[self.left] for group in self.groups]
+        if self.readings and (self.readings[-1][0] < images[0] or self.readings[0][0] > images[-1]):
+            self.warnings.append(
+                f"{self.imu}: its times have none in common with the images; expected one clock"
+            )
 
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""
@@ -175,10 +183,7 @@ class _Vehicle:
 
     def _groups(self) -> list[dict[str, int]]:
         """Topic -> time of what belongs together, for every frame in order."""
-        times: dict[str, set[int]] = {topic: set() for topic in (self.left, self.right, self.points)}
-        for entry in self.log.entries(*times):
-            times[entry.topic].add(entry.header_ns())
-        left, right, points = (sorted(times[topic]) for topic in (self.left, self.right, self.points))
+        left, right, points = self._times()
         eyes, sweeps = nearest(left, right, EYES_NS), nearest(left, points, SWEEP_NS)
         stereo = self.settings.depth == "stereo"
         used = [stamp for stamp in left if stamp in (eyes if stereo else sweeps)]
@@ -206,6 +211,16 @@ class _Vehicle:
             groups.append(group)
         return groups
 
+    def _times(self) -> list[list[int]]:
+        """Times of the left and right images and of the sweeps, increasing."""
+        times: dict[str, list[int]] = {topic: [] for topic in (self.left, self.right, self.points)}
+        for entry in self.log.entries(*times):
+            times[entry.topic].append(entry.header_ns())
+        return [
+            sound_stamps(self.log.name, topic, stamps, self.warnings, remedy="") if stamps else []
+            for topic, stamps in times.items()
+        ]
+
     def _truth(self, fixes: Fixes | None, origin: Array) -> dict[int, Array]:
         """Poses [4, 4] of the images next to a fix; rotations mean nothing and are the identity."""
         if fixes is None:
@@ -228,34 +243,47 @@ class _Vehicle:
         if self.settings.depth == "lidar":
             robot.set_lidar(self.lidar.T_camera_lidar, self.lidar.range_sigma_m)
         feed, scale, empty = ImuFeed(robot, self.readings), ScaleCheck(self.lidar, self.rig), 0
+        broken: list[UnusableImage] = []
         found = gathered(self.log, self.groups, lambda entry: entry.header_ns())
         for parts in track(found, f"convert {robot.name}", len(self.groups)):
             stamp = parts[self.left].header_ns()
             feed.until(stamp)
             points = self._sweep(parts, stamp)
-            if self.settings.depth == "lidar":
-                robot.add_points(stamp, points)
-                color = self.rig.rectify_left(
-                    self.frames.sized(decoded(parts[self.left].read(), self.where), self.where)
-                )
-                robot.add_frame(stamp, encode_png(color), "png", None, T_world_camera=self.truth.get(stamp))
+            try:
+                image, depth, sigma_m = self._images(parts)
+            except UnusableImage as error:
+                broken.append(error)
                 continue
-            image, depth, sigma_m = self.frames.frame(
-                parts[self.left].read(), parts[self.right].read(), self.where
-            )
+            if depth is None:
+                robot.add_points(stamp, points)
             robot.add_frame(
                 stamp, image, "png", depth, T_world_camera=self.truth.get(stamp), depth_sigma_m=sigma_m
             )
-            empty += int((depth == 0).sum())
-            if len(points):
-                scale.add(points, depth)
+            if depth is not None:
+                empty += int((depth == 0).sum())
+                if len(points):
+                    scale.add(points, depth)
+        if len(broken) == len(self.groups):
+            raise broken[0]
+        if broken:
+            self.warnings.append(f"{len(broken)} frames have images that are cut short or broken; left out")
         if self.settings.depth == "lidar":
             return rows
-        pixels = len(self.groups) * self.rig.camera.width * self.rig.camera.height
+        pixels = (len(self.groups) - len(broken)) * self.rig.camera.width * self.rig.camera.height
         ratio = scale.result()
         if ratio is not None and abs(ratio - 1) > MAX_RATIO_ERROR:
             self.warnings.append(f"stereo depth is {ratio:.3f} times that of the LiDAR, expected 1 to 2 %")
         return {**rows, "without_depth": empty / pixels, "stereo_over_lidar": ratio}
+
+    def _images(
+        self, parts: Mapping[str, Entry]
+    ) -> tuple[bytes, NDArray[np.uint16] | None, NDArray[np.float32] | None]:
+        """PNG of the left image, and depth with its standard deviation (m), [h, w]; none of a LiDAR."""
+        left = parts[self.left].read()
+        if self.settings.depth == "stereo":
+            return self.frames.frame(left, parts[self.right].read(), self.where)
+        color = self.rig.rectify_left(self.frames.sized(decoded(left, self.where), self.where))
+        return encode_png(color), None, None
 
     def _sweep(self, parts: Mapping[str, Entry], at_ns: int) -> Array:
         """The points of a frame as of its time; none where it has no sweep."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from duagc.converters.layouts.image_files import check_near
 from duagc.converters.layouts.stereo import RawCamera
 from duagc.converters.layouts.tum_layout import nanoseconds
 from duagc.converters.logs.gather import nearest
@@ -65,8 +66,8 @@ class S3eCalibration:
         def matrix(name: str, *shape: int) -> Array:
             found = numbers(name)
             if found is None or found.size != np.prod(shape) or not np.isfinite(found).all():
-                size = "nothing" if found is None else f"{found.shape}"
-                raise DuagError(f"{path}: {name} is {size}, expected a matrix of {shape}")
+                size = "nothing" if found is None else f"{found.tolist()}"
+                raise DuagError(f"{path}: {name} is {size}, expected a matrix of {shape}, all finite")
             return np.asarray(found, dtype=np.float64).reshape(shape)
 
         def camera(side: str) -> RawCamera:
@@ -145,6 +146,7 @@ def read_fixes(path: Path) -> Fixes | None:
         place = [float(word) for word in words[1:4]]
         if not np.isfinite(place).all():
             raise DuagError(f"{path}:{number}: {line.strip()[:60]!r}, expected meters")
+        check_near(place, f"{path}:{number}")
         rows.setdefault(nanoseconds(words[0], f"{path}:{number}"), place)
     if len(rows) < 3 and all(stamp < 10 * NANOSECONDS for stamp in rows):
         return None

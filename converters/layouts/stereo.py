@@ -268,8 +268,8 @@ class StereoRig:
 
     @property
     def disparities(self) -> int:
-        """How many disparities are tried, a multiple of 16."""
-        largest = self.camera.fx * self.baseline_m / self.options.min_depth_m
+        """How many disparities are tried, a multiple of 16; none is larger than the images are wide."""
+        largest = min(self.camera.fx * self.baseline_m / self.options.min_depth_m, self.camera.width)
         return max(SUBPIXELS, math.ceil(largest / SUBPIXELS) * SUBPIXELS)
 
     @cached_property

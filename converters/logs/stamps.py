@@ -18,6 +18,7 @@ MOST_STEPS_BACK = (
 LONGEST_WAIT_S = 60.0  # between color and depth of one clock
 MOST_APART_S = 0.001  # of the images of a stereo pair
 LONGEST_DELAY_S = 1.0  # between topics: what drivers compute before they publish takes less
+REMEDY = ", or --set time_source=log"
 
 
 def clock_words(least_ns: Mapping[str, int], reference: str) -> list[str]:
@@ -36,7 +37,9 @@ def clock_words(least_ns: Mapping[str, int], reference: str) -> list[str]:
     ]
 
 
-def sound_stamps(name: str, topic: str, times: Sequence[int], warnings: list[str]) -> list[int]:
+def sound_stamps(
+    name: str, topic: str, times: Sequence[int], warnings: list[str], *, remedy: str = REMEDY
+) -> list[int]:
     """The times in their order, each once, without those that are zero.
 
     Args:
@@ -44,13 +47,14 @@ def sound_stamps(name: str, topic: str, times: Sequence[int], warnings: list[str
         topic: of the images.
         times: ns, in order of recording.
         warnings: gets what was left out.
+        remedy: ends the line of an error; of a converter with an option for it.
     Raises:
         DuagError: all times are zero, or the clock was set back.
     """
     if not any(times):
-        raise DuagError(f"{name}: {topic}: all times are zero, expected times, or --set time_source=log")
+        raise DuagError(f"{name}: {topic}: all times are zero, expected times{remedy}")
     if list(times) != sorted(times):
-        _check_steps_back(f"{name}: {topic}", times)
+        _check_steps_back(f"{name}: {topic}", times, remedy)
         warnings.append(f"{topic}: times go backwards; images are taken in order of time")
     if len(set(times)) < len(times):
         warnings.append(f"{topic}: {len(times) - len(set(times))} images repeat a time; left out")
@@ -59,7 +63,7 @@ def sound_stamps(name: str, topic: str, times: Sequence[int], warnings: list[str
     return [time for time in sorted(set(times)) if time]
 
 
-def _check_steps_back(where: str, times: Sequence[int]) -> None:
+def _check_steps_back(where: str, times: Sequence[int], remedy: str) -> None:
     """Refuse times of a clock that was set back: frames of before and after it would be mixed."""
     known = np.array([time for time in times if time], dtype=np.int64)
     back = np.maximum.accumulate(known) - known
@@ -68,7 +72,7 @@ def _check_steps_back(where: str, times: Sequence[int]) -> None:
     if int((back > MOST_STEPS_BACK * interval).sum()) > 1:  # a single image may come late
         raise DuagError(
             f"{where}: times go back by {back[worst] / NANOSECONDS:.3f} s to {known[worst] / NANOSECONDS:.3f} s, as "
-            "of a clock that was set back; expected times in the order of recording, or --set time_source=log"
+            f"of a clock that was set back; expected times in the order of recording{remedy}"
         )
 
 
