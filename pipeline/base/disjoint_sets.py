@@ -12,3 +12,16 @@ def root_of(parent: list[int], element: int) -> int:
         parent[element] = parent[parent[element]]
         element = parent[element]
     return element
+
+
+def join(parent: list[int], a: int, b: int) -> bool:
+    """Make one set of those of two elements, for which its lowest root stands; whether they were two.
+
+    Args:
+        parent: as of `root_of`; changed in place.
+        a: an element.
+        b: another.
+    """
+    low, high = sorted((root_of(parent, a), root_of(parent, b)))
+    parent[high] = low
+    return low != high

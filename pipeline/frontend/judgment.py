@@ -19,6 +19,7 @@ import numpy as np
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
+from duagc.pipeline.base.disjoint_sets import join, root_of
 from duagc.pipeline.config.frontend import FrontendConfig, JudgmentConfig
 from duagc.pipeline.frontend.bundle import Images, KeyframeView
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
@@ -209,27 +210,20 @@ def _parts(count: int, verdicts: Mapping[Ends, PairVerdict]) -> list[int]:
 
     Confirmed pairs connect. A pair that nothing can be said of connects two parts that no pair contradicts.
     """
-    nearer = list(range(count))  # to the lowest of its part
+    parent = list(range(count))
 
     def part(k: int) -> int:
-        while nearer[k] != k:
-            nearer[k] = nearer[nearer[k]]
-            k = nearer[k]
-        return k
-
-    def join(a: int, b: int) -> None:
-        low, high = sorted((part(a), part(b)))
-        nearer[high] = low
+        return root_of(parent, k)
 
     for (first, second), verdict in verdicts.items():
         if verdict is PairVerdict.CONFIRMED:
-            join(first, second)
+            join(parent, first, second)
     against = [ends for ends, verdict in verdicts.items() if verdict.contradicts]
     for (first, second), verdict in sorted(verdicts.items()):
         if verdict is PairVerdict.OPEN and part(first) != part(second):
             between = {part(first), part(second)}
             if not any({part(i), part(j)} == between for i, j in against):
-                join(first, second)
+                join(parent, first, second)
     return [part(k) for k in range(count)]
 
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.disjoint_sets import root_of
+from duagc.pipeline.base.disjoint_sets import join, root_of
 from duagc.pipeline.base.errors import DuagError
 
 Index = NDArray[np.int64]
@@ -30,9 +30,7 @@ def spanning_forest(count: int, edges: Sequence[tuple[int, int]]) -> tuple[list[
     group = list(range(count))
     used = []
     for position, (i, j) in enumerate(edges):
-        a, b = root_of(group, i), root_of(group, j)
-        if a != b:
-            group[max(a, b)] = min(a, b)
+        if join(group, i, j):
             used.append(position)
     return used, np.array([root_of(group, k) for k in range(count)], dtype=np.int64)
 
