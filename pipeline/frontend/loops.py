@@ -13,7 +13,6 @@ from duagc.pipeline.frontend.keyframe_graph import overlap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import RegistrationConfig
-from duagc.pipeline.registration.features import count_matches
 from duagc.pipeline.registration.geometric_verification import VerificationView, verify
 from duagc.pipeline.registration.place_recognition import Places
 
@@ -49,7 +48,7 @@ def find_loops(
     first_left, found = checkpoints.resume(part) or (config.min_gap, [])
     places = Places([view.features.descriptors[: config.features_compared] for view in views])
     for second in range(first_left, len(views)):
-        for first in _resembling(views, second, places, config):
+        for first in sorted(k for _, k in places.resembling(second, second - config.min_gap + 1, config)):
             T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
             seen = overlap(views[first].reference.levels[-1], views[second].coarsest, T_first_second)
             if seen >= config.known_overlap:
@@ -73,16 +72,3 @@ def _verification_view(
 ) -> VerificationView:
     levels = len(registration.iterations)
     return VerificationView(view.features, view.reference, lambda: images(index, levels))
-
-
-def _resembling(views: Sequence[KeyframeView], second: int, places: Places, config: LoopConfig) -> list[int]:
-    """Earlier keyframes with most matches among the strongest features, ascending.
-
-    Features are compared with those of a bounded number of keyframes only, however many there are.
-    """
-    theirs, scored = views[second].features, []
-    for first in places.alike(second, second - config.min_gap + 1, config.compared):
-        score = count_matches(views[first].features, theirs, config.features_compared, config.ratio)
-        if score >= config.min_matches:
-            scored.append((-score, first))
-    return sorted(first for _, first in sorted(scored)[: config.candidates])

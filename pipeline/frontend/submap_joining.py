@@ -36,7 +36,6 @@ from duagc.pipeline.posegraph.loop_closures import (
 from duagc.pipeline.posegraph.moved_things import TwoMotions, following_moved_things
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePose, RelativePoses
 from duagc.pipeline.posegraph.surface_agreement import surface_agreement
-from duagc.pipeline.registration.features import matches
 from duagc.pipeline.registration.geometric_verification import VerificationView, verify
 from duagc.pipeline.registration.place_recognition import Places
 
@@ -187,11 +186,9 @@ def _resembling(first: TrackedSubmap, second: TrackedSubmap, config: SubmapConfi
     other = [keyframe.features.descriptors[:most] for keyframe in second.keyframes]
     places = Places([*one, *other])
     ranked = []
-    for j, theirs in enumerate(other):
-        alike = places.alike(len(one) + j, len(one), config.compared)
-        scores = [(len(matches(one[i], theirs, config.ratio)), i) for i in alike if len(one[i])]
-        enough = sorted((-score, i) for score, i in scores if score >= config.min_matches)
-        ranked += [(rank, score, i, j) for rank, (score, i) in enumerate(enough[: config.candidates])]
+    for j in range(len(other)):
+        best = places.resembling(len(one) + j, len(one), config)
+        ranked += [(rank, -score, i, j) for rank, (score, i) in enumerate(best)]
     return [(i, j) for _, _, i, j in sorted(ranked)[: config.max_verified]]
 
 

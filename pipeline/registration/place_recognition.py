@@ -9,16 +9,37 @@ once and for all. Sums of small integers are exact in float32, so the ranking do
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.registration.features import DIMENSIONS, Descriptors
+from duagc.pipeline.registration.features import DIMENSIONS, Descriptors, matches
 
 TABLES = 8
 DIRECTIONS = 128  # per table, two words each
 WORDS = 2 * DIRECTIONS
+
+
+class PlaceLimits(Protocol):
+    """Which views resemble a view.
+
+    Attributes:
+        compared: views, those that share most words, whose descriptors are compared.
+        ratio: of the ratio test of the matches.
+        min_matches: from which a view resembles.
+        candidates: at most so many do, those with most matches.
+    """
+
+    @property
+    def compared(self) -> int: ...
+    @property
+    def ratio(self) -> float: ...
+    @property
+    def min_matches(self) -> int: ...
+    @property
+    def candidates(self) -> int: ...
 
 
 class Places:
@@ -30,6 +51,7 @@ class Places:
         Args:
             views: descriptors of every view, uint8 [n, 128] each.
         """
+        self._views = views
         center = center_of(views)
         self._has = np.stack([_words(d.astype(np.float32) - center) for d in views])
 
@@ -48,6 +70,24 @@ class Places:
         shared = self._has[:among] @ self._has[view]
         score = shared / np.sqrt(np.maximum(self._has[:among].sum(axis=1), 1))
         return sorted(np.argsort(-score, kind="stable")[:most].tolist())
+
+    def resembling(self, view: int, among: int, limits: PlaceLimits) -> list[tuple[int, int]]:
+        """Views with most matches, each with their number, the best first, of several the earlier.
+
+        Descriptors are compared with those of a bounded number of views only, however many there are.
+
+        Args:
+            view: its index.
+            among: only the first so many views are compared.
+            limits: how many, and from how many matches.
+        """
+        theirs = self._views[view]
+        scores = [
+            (len(matches(self._views[k], theirs, limits.ratio)), k)
+            for k in self.alike(view, among, limits.compared)
+        ]
+        enough = [(score, k) for score, k in scores if score >= limits.min_matches]
+        return sorted(enough, key=lambda scored: (-scored[0], scored[1]))[: limits.candidates]
 
 
 def center_of(views: Sequence[Descriptors]) -> NDArray[np.float32]:

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from duagc.pipeline.config.frontend import LoopConfig
+from duagc.pipeline.registration.features import matches
 from duagc.pipeline.registration.place_recognition import Places
 
 
@@ -35,3 +37,17 @@ def test_views_without_features_are_last(views: list[np.ndarray]) -> None:
     assert places.alike(4, 4, 1) == [1]
     assert places.alike(4, 4, 3) == [1, 2, 3]
     assert Places([empty, empty]).alike(1, 1, 1) == [0]
+
+
+@pytest.mark.parametrize("candidates", [1, 3])
+def test_views_with_most_matches_resemble_the_earlier_first(views: list[np.ndarray], candidates: int) -> None:
+    limits = LoopConfig(min_matches=20, candidates=candidates)
+    shown = [views[0], views[7], views[3], views[7], views[107]]
+    found = Places(shown).resembling(4, 4, limits)
+    assert [k for _, k in found] == [1, 3][:candidates], "equal views, of which the earlier comes first"
+    assert [count for count, _ in found] == [
+        len(matches(shown[k], shown[4], limits.ratio)) for k in [1, 3][:candidates]
+    ]
+    assert Places(shown).resembling(4, 1, limits) == [], "of the first view alone"
+    empty = np.zeros((0, 128), dtype=np.uint8)
+    assert Places([empty, views[7], empty]).resembling(2, 2, limits) == []
