@@ -85,10 +85,12 @@ class Reference:
 
     @staticmethod
     def sample(pyramid: RgbdPyramid, count: int = 2000) -> Reference:
-        """At most about `count` samples, the same points and normals at every level, for sending to another robot.
+        """About `count` samples, the same points and normals at every level, for sending to another robot.
 
         Two thirds are the pixels of strongest gray gradient in the tiles of a grid, one third is spread evenly
         over a coarser grid, so that weakly textured surfaces still determine the geometry. No random draws.
+        Tiles have whole pixels: of 640x480, 4 % more than `count` are taken, of 160x120 42 %, and never three times
+        as many.
 
         Args:
             pyramid: of the view.
