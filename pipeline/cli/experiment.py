@@ -98,7 +98,7 @@ def run(
     if bool(names) == everything:
         raise typer.BadParameter("expected names of experiments, or --all", param_hint="NAME")
     chosen = [read_experiment(name) for name in (experiment_names() if everything else names or [])]
-    recordings = dict(_named_folder(text) for text in recording or ())
+    recordings = _named_folders(recording or ())
     for experiment in chosen:
         experiment.profile(profile)
         check_packages(experiment, profile)
@@ -165,8 +165,14 @@ def _predicted(experiments: Sequence[Experiment], profile: str) -> str:
     return f"{took.runs} runs, {took.different} different, about {in_words(took.cpu_s)} of processor time"
 
 
-def _named_folder(text: str) -> tuple[str, Path]:
-    name, separator, folder = text.partition("=")
-    if not separator or not name or not folder:
-        raise DuagError(f"--recording {text}: expected NAME=FOLDER")
-    return name, Path(of_home(folder))
+def _named_folders(texts: Sequence[str]) -> dict[str, Path]:
+    """Recordings by their names, of NAME=FOLDER each."""
+    named: dict[str, Path] = {}
+    for text in texts:
+        name, separator, folder = text.partition("=")
+        if not separator or not name or not folder:
+            raise DuagError(f"--recording {text}: expected NAME=FOLDER")
+        if name in named:
+            raise DuagError(f"--recording {text}: found {named[name]} as {name}, expected every name once")
+        named[name] = Path(of_home(folder))
+    return named

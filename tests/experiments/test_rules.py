@@ -228,6 +228,9 @@ def test_a_recording_without_truth_is_refused_before_anything_runs(tmp_path: Pat
         (f"there={tmp_path / 'nowhere'}", "nowhere/recording.json"),
     ):
         assert_one_line(duagc_here("experiment", "run", "h1_team", "--recording", text, "--out", out), said)
+    twice = ("--recording", given, "--recording", f"wall={tmp_path}")
+    said = f"--recording wall={tmp_path}: found {fake.recording} as wall, expected every name once"
+    assert_one_line(duagc_here("experiment", "run", "h1_team", *twice, "--out", out), said)
     assert not out.exists()
 
 
