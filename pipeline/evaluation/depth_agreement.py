@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import combinations
 
 import numpy as np
@@ -123,19 +124,23 @@ def _compare(inverse_depth: Array, points: Array, camera: PinholeCamera) -> Arra
     """Measured minus predicted depth of points in the frame of an image, where it was measured."""
     if not len(points):
         return None
-    front = points[points[:, 2] > 0.05]
-    u, v = camera.project(front).T
+    x, y, z = np.ascontiguousarray(points.T)  # three rows are read faster than columns
+    if not (front := z > 0.05).all():
+        x, y, z = x[front], y[front], z[front]
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     # all four pixels around it; the last row and column have none after them
-    seen = inside(u, v, (camera.height - 1, camera.width - 1))
-    if np.count_nonzero(seen) < MIN_VIEW * len(points):
+    seen = np.flatnonzero(inside(u, v, (camera.height - 1, camera.width - 1)))
+    if len(seen) < MIN_VIEW * len(points):
         return None
-    u, v, z = u[seen], v[seen], front[seen, 2]
+    u, v, z = u[seen], v[seen], z[seen]
     i, j = v.astype(np.int64), u.astype(np.int64)
-    a, b = u - j, v - i
-    corners = np.stack(
-        [inverse_depth[i, j], inverse_depth[i, j + 1], inverse_depth[i + 1, j], inverse_depth[i + 1, j + 1]]
-    )
-    known = corners.max(axis=0) - corners.min(axis=0) < SAME_SURFACE * corners[0]  # false for NaN
-    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
-    measured = 1 / np.sum(weights * corners, axis=0)
-    return np.asarray((measured - z)[known]) if np.count_nonzero(known) >= MIN_POINTS else None
+    pixels, at = inverse_depth.ravel(), i * camera.width + j
+    corners = [pixels.take(at + step) for step in (0, 1, camera.width, camera.width + 1)]
+    low, high = (reduce(extreme, corners) for extreme in (np.minimum, np.maximum))
+    known = np.flatnonzero(high - low < SAME_SURFACE * corners[0])  # false for NaN
+    if len(known) < MIN_POINTS:
+        return None
+    a, b = (u - j)[known], (v - i)[known]
+    weights = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+    terms = [weight * corner[known] for weight, corner in zip(weights, corners, strict=True)]
+    return np.asarray(1 / (terms[0] + terms[1] + terms[2] + terms[3]) - z[known])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from duagc.pipeline.evaluation.depth_agreement import MIN_PAIRS, _compare, depth_agreement
+from duagc.pipeline.evaluation.depth_agreement import MIN_PAIRS, SAME_SURFACE, _compare, depth_agreement
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from tests.fixtures.room import CAMERA, pose, render
@@ -71,3 +71,29 @@ def test_points_are_compared_wherever_four_pixels_are_around_them() -> None:
     assert found is not None
     assert len(found) == pytest.approx(np.sum(whole), abs=2)
     np.testing.assert_allclose(found, 0.01, atol=1e-9)
+
+
+def test_depths_are_compared_to_the_bit_as_they_are_defined() -> None:
+    """Random inverse depth with holes; some points lie outside, some behind."""
+    rng = np.random.default_rng(0)
+    inverse = 0.5 + 0.004 * rng.standard_normal((CAMERA.height, CAMERA.width))
+    inverse[rng.random(inverse.shape) < 0.1] = np.nan
+    points = rng.standard_normal((4000, 3)) * [0.8, 0.6, 0.3] + [0.0, 0.0, 1.5]
+    points[::50, 2] *= -1
+    found = _compare(inverse, points, CAMERA)
+    expected = []
+    for x, y, z in points:
+        if z <= 0.05:
+            continue
+        u, v = CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy
+        if not (0 <= u < CAMERA.width - 1 and 0 <= v < CAMERA.height - 1):
+            continue
+        i, j = int(v), int(u)
+        a, b = u - j, v - i
+        corners = inverse[i, j], inverse[i, j + 1], inverse[i + 1, j], inverse[i + 1, j + 1]
+        if max(corners) - min(corners) < SAME_SURFACE * corners[0] and np.isfinite(corners).all():
+            weights = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+            total = weights[0] * corners[0] + weights[1] * corners[1] + weights[2] * corners[2]
+            expected.append(1 / (total + weights[3] * corners[3]) - z)
+    assert found is not None
+    assert found.tolist() == expected
