@@ -245,20 +245,7 @@ class MapBuilder:
             if first < len(self._tiles):
                 self._whole.go_on(whole)
         for number, tile in enumerate(self._tiles[first:], first):
-            mapper, self._kept = self._kept, None
-            if mapper is not None and found is None:
-                mapper.begin(take_tile(self._whole, tile, (), ()))  # its images are here
-            else:
-                mapper = self._mapper(number, every, taken=found is None, supporting=of_tile[number])
-                for k in tile:
-                    self._with_images(mapper.put_back, k, seeds=True)
-            for frame in of_tile[number]:
-                self._support(mapper, frame)
-            views = [
-                *(self._keyframes[k].frame_index for k in tile),
-                *(f.frame_index for f in of_tile[number]),
-            ]
-            mapper.open_shutter([self.log.moments(index) for index in views])
+            mapper = self._mapper_of_all_views(number, of_tile[number], taken=found is None)
             others = (number, self._whole.state(), self._poses, all_stats)
             before = sum(alone[:number])
             save = TileCheckpoints(self._checkpoints, others, found=found, before=before, total=steps)
@@ -276,6 +263,22 @@ class MapBuilder:
             save = TileCheckpoints(self._checkpoints, done, found=found, before=sum(alone), total=steps)
             stats = self._trained_jointly(supporting, steps - sum(alone), save, stats)
         return replace(stats, total=len(self._whole)), self._poses, self._whole.state()
+
+    def _mapper_of_all_views(self, number: int, supporting: Sequence[TrackedFrame], *, taken: bool) -> Mapper:
+        """A tile's mapper with all views; its Gaussians are taken out of the whole map, or a checkpoint has them."""
+        tile = self._tiles[number]
+        mapper, self._kept = self._kept, None
+        if mapper is not None and taken:
+            mapper.begin(take_tile(self._whole, tile, (), ()))  # its images are here
+        else:
+            mapper = self._mapper(number, range(len(self._keyframes)), taken=taken, supporting=supporting)
+            for k in tile:
+                self._with_images(mapper.put_back, k, seeds=True)
+        for frame in supporting:
+            self._support(mapper, frame)
+        views = [self._keyframes[k].frame_index for k in tile] + [f.frame_index for f in supporting]
+        mapper.open_shutter([self.log.moments(index) for index in views])
+        return mapper
 
     def _trained_jointly(
         self, supporting: Sequence[TrackedFrame], steps: int, save: Checkpoints, stats: MappingStats
