@@ -26,7 +26,14 @@ from duagc.converters.logs.describe import namespaces
 from duagc.converters.logs.measured_frames import FARTHEST, measured, rules_of_depth
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
-from duagc.converters.logs.sources import Source, piece_before, pieces_words, sources_of, unread
+from duagc.converters.logs.sources import (
+    Source,
+    overlap_words,
+    piece_before,
+    pieces_words,
+    sources_of,
+    unread,
+)
 from duagc.converters.robot_writer import RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
@@ -72,6 +79,8 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         robot_logs = {}
         for part in sources:
             log = opened.enter_context(open_log(part.paths, part.name))
+            if src.suffix != ".toml" and (words := overlap_words(part, log)):
+                raise DuagError(words)
             robot_logs[part.robot] = _robot_log(log, part, sources)
         spans = {robot: (min(found.pairs), max(found.pairs)) for robot, found in robot_logs.items()}
         if src.suffix != ".toml" and (words := pieces_words(sources, spans)):

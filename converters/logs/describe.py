@@ -19,7 +19,15 @@ from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import SUFFIXES, Log, is_own_log, open_log
 from duagc.converters.logs.motion import IMU_TYPE, POSE_TYPES
 from duagc.converters.logs.robot_log import RobotLog
-from duagc.converters.logs.sources import Source, is_log, pieces_words, robot_of, sources_of, unread
+from duagc.converters.logs.sources import (
+    Source,
+    is_log,
+    overlap_words,
+    pieces_words,
+    robot_of,
+    sources_of,
+    unread,
+)
 from duagc.converters.logs.video import is_video
 from duagc.pipeline.base.byte_counts import bytes_text
 from duagc.pipeline.base.errors import DuagError
@@ -75,6 +83,8 @@ def describe(src: Path) -> dict[str, Any]:
             log = opened.enter_context(open_log(source.paths, source.name))
             if log.name not in logs:
                 logs[log.name] = _log(log)
+                if src.suffix != ".toml" and (words := overlap_words(source, log)):
+                    pieces.append(words)
             robot_log, robots[source.robot] = _robot(log, source)
             if spaces:
                 robots[source.robot]["by_namespace"] = spaces

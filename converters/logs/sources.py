@@ -13,13 +13,16 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from duagc.converters.layouts.image_files import options_of
 from duagc.converters.logs.choice import IMAGE_TYPES
-from duagc.converters.logs.files import SUFFIXES, is_own_log, open_log
+from duagc.converters.logs.files import SUFFIXES, Log, is_own_log, open_log
 from duagc.converters.logs.options import LogOptions
+from duagc.converters.logs.video import is_video
 from duagc.converters.writer import robot_names
 from duagc.pipeline.base.atomic_folder import RECORDING, RUN
 from duagc.pipeline.base.errors import DuagError, closest
@@ -273,6 +276,37 @@ def pieces_words(sources: Sequence[Source], spans_ns: Mapping[str, tuple[int, in
                 "that says which robots they are"
             )
     return ""
+
+
+def overlap_words(source: Source, log: Log) -> str:
+    """What to say of logs in one folder that hold images of one topic at one time, as logs of two robots do.
+
+    Args:
+        source: of a robot.
+        log: its logs, open.
+
+    Returns:
+        Empty: one goes on where the other ends, as pieces of one log do, or `pieces` says that they are pieces.
+    """
+    looked_at = _image_topics(log) if len(log.parts) > 1 and not source.settings.pieces else []
+    for topic in looked_at:
+        holding = [part for part in log.parts if topic in part.topics and part.topics[topic].count]
+        begins = [(next(iter(part.entries([topic], [topic]))).log_ns, part) for part in holding]
+        for (_, part), (begin_ns, after) in pairwise(sorted(begins, key=itemgetter(0))):
+            if any(entry.log_ns > begin_ns for entry in part.entries([topic], [topic])):
+                return (
+                    f"{source.name}: {topic} is in {part.path.name} and in {after.path.name} at the same time, "
+                    f"expected pieces of one log; if each is a robot's, convert {source.name} itself, or list the "
+                    "logs of each robot in a TOML file"
+                )
+    return ""
+
+
+def _image_topics(log: Log) -> list[str]:
+    """Names of topics of images or video."""
+    return sorted(
+        t.name for t in log.topics.values() if t.count and (t.type in IMAGE_TYPES or is_video(t.type))
+    )
 
 
 def piece_before(source: Source, sources: Sequence[Source]) -> Source | None:

@@ -96,6 +96,20 @@ def test_logs_of_robots_that_are_called_alike_are_not_one_log(tmp_path: Path) ->
     assert not (tmp_path / "rec").exists()
 
 
+def test_logs_of_robots_in_a_folder_below_are_not_one_log(tmp_path: Path) -> None:
+    """As when the folder above that of the logs is named: their images would take turns in one recording."""
+    r, logs = Ros(1), tmp_path / "campaign" / "day"
+    logs.mkdir(parents=True)
+    for k in range(2):
+        r.write(logs / f"robot_{k}", later(r, still(r), k * 15_000_000), "plain")
+    words = r"is in robot_0.bag and in robot_1.bag at the same time, expected pieces of one log; .*day itself"
+    with pytest.raises(DuagError, match=words):
+        registry.convert("ros", logs.parent, tmp_path / "rec")
+    assert any("at the same time" in text for text in describe(logs.parent)["warnings"])
+    registry.convert("ros", logs, tmp_path / "rec")
+    assert sorted(info(tmp_path / "rec")["robots"]) == ["alpha", "bravo"]
+
+
 def test_what_only_the_first_piece_says_is_missed_in_the_next(tmp_path: Path) -> None:
     r, logs = Ros(1), tmp_path / "split"
     logs.mkdir()
