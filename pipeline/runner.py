@@ -11,7 +11,7 @@ from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
 from duagc.pipeline.base import determinism
-from duagc.pipeline.base.atomic_folder import check_apart, new_folder
+from duagc.pipeline.base.atomic_folder import ANYTHING, RUN, check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.worker_reports import listening
 from duagc.pipeline.base.workers import worker_pool
@@ -95,7 +95,7 @@ def _run(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, l
             log(f"{out}: up to date")
             return
         force = completed = True
-    with new_folder(out, force) as folder:
+    with new_folder(out, force, ANYTHING if completed else RUN) as folder:
         Job(recording, folder, config, plan, log=log, place=out).run()
         if completed:
             keep_what_holds(recording, folder, config, plan, out=out, log=log)

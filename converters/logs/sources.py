@@ -235,7 +235,7 @@ def _inside(folder: Path) -> tuple[Path, ...]:
 
 
 def _is_own_folder(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in (*RECORDING[1], *RUN[1]))
+    return any((folder / name).is_file() for name in (*RECORDING.marks, *RUN.marks))
 
 
 def unread(src: Path) -> list[str]:

@@ -5,24 +5,52 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import NamedTuple
 
 from duagc.pipeline.base.errors import DuagError
 
-RUN = "a run", ("manifest.json",)
-DEMO = "a run", ("manifest.json", "run/manifest.json")
-RECORDING = "a recording", ("recording.json",)
+
+class FolderKind(NamedTuple):
+    """What a folder is, and what of it may be lost when it is replaced.
+
+    Attributes:
+        name: for messages.
+        marks: files of which one marks such a folder.
+        contents: names of what is in it, by patterns; that of a folder stands for all that it holds.
+    """
+
+    name: str
+    marks: tuple[str, ...]
+    contents: tuple[str, ...]
+
+
+_OF_A_RUN = "config.toml manifest.json timing.json metrics.* *.mcap run.rrd report robots calibrated"
+RUN = FolderKind("a run", ("manifest.json",), tuple(_OF_A_RUN.split()))
+ANYTHING = RUN._replace(contents=("*",))
+"""Of a run whose maker brings over what the earlier one in its place holds besides."""
+RECORDING = FolderKind("a recording", ("recording.json",), ("recording.json", "*.mcap", "*.ply"))
+DEMO = FolderKind(
+    "a run",
+    (*RUN.marks, "run/manifest.json"),
+    (
+        *RUN.contents,
+        *(f"run/{name}" for name in RUN.contents),
+        *(f"recording/{name}" for name in RECORDING.contents),
+    ),
+)
 
 
 @contextmanager
-def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) -> Iterator[Path]:
+def new_folder(out: Path, force: bool, kind: FolderKind = RUN) -> Iterator[Path]:
     """A folder next to `out` that takes its name when the block ends well, and is removed when it does not.
 
     Args:
         out: name of the finished folder.
-        force: replace what is there, if it is empty or of this kind. A symbolic link stays, and the folder
-            that it names is replaced.
-        kind: name of the kind for messages, and the files of which one marks such a folder.
+        force: replace what is there, if it is empty or of this kind, and holds nothing else. A symbolic link stays,
+            and the folder that it names is replaced.
+        kind: what may be replaced.
 
     Yields:
         The folder to write to, empty.
@@ -171,7 +199,7 @@ def _is_named(lock: int, folder: Path) -> bool:
         return False
 
 
-def _check_out(out: Path, force: bool, kind: tuple[str, tuple[str, ...]]) -> None:
+def _check_out(out: Path, force: bool, kind: FolderKind) -> None:
     """Refuse to replace what is there, unless `force` and nothing of another kind would be lost."""
     if not out.name:
         raise DuagError(f"{out}: found a path without a name, expected the name of a new folder")
@@ -181,6 +209,18 @@ def _check_out(out: Path, force: bool, kind: tuple[str, tuple[str, ...]]) -> Non
         return
     if not force:
         raise DuagError(f"{out}: exists already; choose another --out or give --force")
-    name, marks = kind
-    if not out.is_dir() or (any(out.iterdir()) and not any((out / mark).is_file() for mark in marks)):
-        raise DuagError(f"{out}: is not {name}, expected one; --force replaces nothing else")
+    if not out.is_dir() or (any(out.iterdir()) and not any((out / mark).is_file() for mark in kind.marks)):
+        raise DuagError(f"{out}: is not {kind.name}, expected one; --force replaces nothing else")
+    for path in sorted(out.rglob("*")):
+        if (path.is_symlink() or not path.is_dir()) and not _is_of(path.relative_to(out).parts, kind):
+            raise DuagError(
+                f"{path}: --force would remove it, though it is no part of {kind.name}; move it, or choose another name"
+            )
+
+
+def _is_of(parts: Sequence[str], kind: FolderKind) -> bool:
+    """Whether a file, or the beginning of one, is among the contents, by the parts of its path in the folder."""
+    *folders, name = parts
+    names = (*folders, name.removesuffix(".part"))
+    wanted = (pattern.split("/") for pattern in kind.contents)
+    return any(len(names) >= len(words) and all(map(fnmatchcase, names, words)) for words in wanted)

@@ -30,6 +30,7 @@ def batch(
 
     Example: `duagc batch suites/links.toml --out outputs/links --workers 2`
     """
+    from duagc.pipeline.base.atomic_folder import RECORDING, RUN
     from duagc.pipeline.batch.batch import run_batch, status_text
     from duagc.pipeline.batch.cell import read_state
     from duagc.pipeline.batch.engines import engine_of
@@ -46,6 +47,9 @@ def batch(
         return
     if out.exists() and not out.is_dir():
         raise DuagError(f"{out}: is no folder, expected that of a batch")
+    for kind in (RECORDING, RUN):
+        if any((out / mark).is_file() for mark in kind.marks):
+            raise DuagError(f"{out}: is {kind.name}, expected the folder of a batch, or a new one")
     place = store or default_store(out / "run")
     Store(place)  # what is none is refused before a cell begins
     with engine_of(engine, workers, out) as chosen:

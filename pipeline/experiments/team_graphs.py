@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.atomic_folder import FolderKind, new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from duagc.pipeline.base.random_streams import generator
@@ -29,7 +29,9 @@ _APART = 60  # keyframes between the ends of a loop of one robot
 _LONGEST, _STRIDE = 15, 2  # loop closures of a stretch or cluster; keyframes between two of them
 _SINGLE, _OWN = 0.1, 0.25  # share of false ones that stand alone; share of loops within one robot
 _TRIES = 200_000
-GRAPH = "a team's pose graph", ("reference_inliers.csv",)
+GRAPH = FolderKind(
+    "a team's pose graph", ("reference_inliers.csv",), ("reference_inliers.csv", "robot*/measurements.csv")
+)
 COLUMNS = "robot_src,pose_src,robot_dst,pose_dst,qx,qy,qz,qw,tx,ty,tz,kappa,tau"
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.base.atomic_folder import check_apart, new_folder
+from duagc.pipeline.base.atomic_folder import FolderKind, check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from duagc.pipeline.base.ply_points import write_points
@@ -24,7 +24,7 @@ from duagc.pipeline.splat.ply import write_ply
 
 FORMAT, SCHEMA = "duagc.export", 1
 EXPORT_FILE = "export.json"
-EXPORT = "an export", (EXPORT_FILE,)  # what `new_folder` may replace
+EXPORT = FolderKind("an export", (EXPORT_FILE,), (EXPORT_FILE, "*.ply", "*/*.ply"))
 
 SMALLEST_TILE_M = 0.1
 

@@ -9,6 +9,7 @@ import pytest
 from duagc.pipeline.base import atomic_folder
 from duagc.pipeline.base.atomic_folder import check_apart, new_folder
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.runs.stages import STAGES
 
 
 def write(out: Path, text: str) -> None:
@@ -30,6 +31,33 @@ def test_a_folder_is_replaced_and_nothing_else_is_left(tmp_path: Path) -> None:
     write(tmp_path / "run", "new")
     assert content(tmp_path / "run") == {"manifest.json": "new", "fused.mcap": "new"}
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "cloud/a.ply", "inner/manifest.json", ".git/HEAD", "link"])
+def test_a_folder_that_holds_something_else_is_not_replaced(tmp_path: Path, name: str) -> None:
+    out = tmp_path / "run"
+    write(out, "old")
+    (out / name).parent.mkdir(exist_ok=True)
+    (out / name).symlink_to(tmp_path) if name == "link" else (out / name).write_text("mine")
+    with pytest.raises(
+        DuagError, match=rf"run/{name}: --force would remove it, though it is no part of a run"
+    ):
+        write(out, "new")
+    assert (out / "manifest.json").read_text() == "old"
+    assert (out / name).exists()
+
+
+def test_what_a_run_consists_of_is_what_its_stages_write(tmp_path: Path) -> None:
+    """Beginnings of its files as well, which a process that was killed leaves."""
+    out = tmp_path / "run"
+    write(out, "old")
+    files = [f"robots/alpha/{name}" if s.per_robot else name for s in STAGES for name in s.writes_files]
+    for name in [file.replace("*", "alpha") for file in files]:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("old")
+        (out / f"{name}.part").write_text("old")
+    write(out, "new")
+    assert content(out) == {"manifest.json": "new", "fused.mcap": "new"}
 
 
 def test_what_is_stopped_while_it_removes_the_old_one_leaves_the_new_one(tmp_path, monkeypatch) -> None:

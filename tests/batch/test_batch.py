@@ -121,6 +121,12 @@ def test_what_does_not_exist_is_one_line_before_anything_runs(
     assert not out.exists()
 
 
+def test_a_batch_does_not_write_into_a_recording(suite: Suite, fake: fake_run.FakeRun) -> None:
+    before = sorted(path.name for path in fake.recording.iterdir())
+    assert_one_line(duagc_here("batch", suite.path, "--out", fake.recording), "is a recording, expected the")
+    assert sorted(path.name for path in fake.recording.iterdir()) == before
+
+
 def test_a_failed_cell_is_tried_again_once_and_stops_no_other(suite: Suite, tmp_path: Path) -> None:
     engine, said = Pretended(tmp_path, {"wall-plain-1": 1, "wall-lossy-0": 2}), list[str]()
     states = run_batch(suite, tmp_path, tmp_path / "store", engine, log=said.append)
