@@ -58,13 +58,13 @@ def _from_file(path: Path) -> ModuleType:
 
 def convert(
     dataset: str,
-    src: Path,
-    out: Path,
+    src: str | Path,
+    out: str | Path,
     robots: int | None = None,
     *,
     force: bool = False,
     options: Sequence[str] = (),
-    options_file: Path | None = None,
+    options_file: str | Path | None = None,
     masks: Sequence[str] = (),
 ) -> None:
     """Convert a dataset into a recording.
@@ -82,8 +82,9 @@ def convert(
     Raises:
         DuagError: names the file, what was found and what was expected.
     """
+    src, out, options_file = Path(src), Path(out), None if options_file is None else Path(options_file)
     files = [Path(mask.partition("=")[2] or mask) for mask in masks]
-    check_apart(Path(out), [Path(src), *files, *([options_file] if options_file else [])])
+    check_apart(out, [src, *files, *([options_file] if options_file else [])])
     module = _module(dataset)
     count = {} if robots is None else {"robots": robots}
     said = parse_options(options)
@@ -97,10 +98,10 @@ def convert(
                 )
         token = USER_MASKS.set(user_masks(masks, filed.pop("masks", ()), options_file))
         try:
-            module.convert(Path(src), Path(out), force=force, **count, **{**filed, **said})
+            module.convert(src, out, force=force, **count, **{**filed, **said})
         finally:
             USER_MASKS.reset(token)
-    if not (Path(out) / "recording.json").is_file():
+    if not (out / "recording.json").is_file():
         raise DuagError(
             f"{dataset}: wrote no {out}/recording.json, expected a recording; see RecordingWriter"
         )

@@ -76,7 +76,7 @@ class RecordingWriter:
 
     def __init__(
         self,
-        out: Path,
+        out: str | Path,
         name: str = "",
         source: Mapping[str, Any] | None = None,
         converter: str = "",

@@ -35,7 +35,7 @@ METER_IMAGE = (40, 30)  # of the exposure meter
 
 
 def simulate(
-    out: Path,
+    out: str | Path,
     *,
     robots: int = 2,
     frames: int = 160,
@@ -48,7 +48,7 @@ def simulate(
     force: bool = False,
     up: str = "auto",
     paradigm: str = "wander",
-    preview: Path | None = None,
+    preview: str | Path | None = None,
     rig: Rig | None = None,
     movers: int = 0,
     masks: bool = True,
@@ -105,9 +105,10 @@ def simulate(
         triangles=triangles,
     )
     settings.check()
+    out, preview = Path(out), None if preview is None else Path(preview)
     if scene not in SCENES:
-        check_apart(Path(out), [Path(scene)])
-    _check_output(Path(out), workers, preview, force)
+        check_apart(out, [Path(scene)])
+    _check_output(out, workers, preview, force)
     _check_paths(settings, paths)
     determinism.configure_determinism()
     determinism.configure_opencv()

@@ -34,7 +34,7 @@ _CLOCK_WORDS = (
 )
 
 
-def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = None) -> Report:
+def check(path: str | Path, config: ChecksConfig = _DEFAULT, *, store: str | Path | None = None) -> Report:
     """Check a recording, or the log of one robot.
 
     Args:

@@ -90,7 +90,7 @@ def evaluate(
     progress: bool = True,
     own_longer: Mapping[str, Gaussians] | None = None,
     most_views: int = MOST_VIEWS,
-    saved: Path | None = None,
+    saved: str | Path | None = None,
     matched: Mapping[str, MatchedViews] | None = None,
     hear: Hear = lambda step: None,
 ) -> dict[str, Any]:
@@ -118,6 +118,7 @@ def evaluate(
         DuagError: the run or the recording is incomplete or they do not fit together.
     """
     run_dir, recording = Path(run_dir), Path(recording)
+    saved = None if saved is None else Path(saved)
     run, source = RunFolder(run_dir), Recording(recording)
     unknown = sorted({robot_of(name) for name in run.robots} - set(source.robots))
     if unknown:

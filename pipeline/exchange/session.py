@@ -33,8 +33,8 @@ def run_session(
     config: ExchangeConfig,
     *,
     seed: int,
-    exchange_path: Path,
-    consensus_path: Path,
+    exchange_path: str | Path,
+    consensus_path: str | Path,
     watch: RoundWatch | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> dict[str, SessionResult]:
@@ -59,8 +59,8 @@ def run_session(
         data,
         config,
         seed=seed,
-        exchange_path=exchange_path,
-        consensus_path=consensus_path,
+        exchange_path=Path(exchange_path),
+        consensus_path=Path(consensus_path),
         watch=watch,
         checkpoints=checkpoints,
     )

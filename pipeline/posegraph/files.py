@@ -78,7 +78,9 @@ class TeamGraph:
         return found
 
 
-def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bool = False) -> TeamGraph:
+def read_team_graph(
+    path: str | Path, robots: int | None = None, *, only_reference: bool = False
+) -> TeamGraph:
     """Read a pose graph and give every robot its own.
 
     Args:
@@ -91,7 +93,7 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
     Raises:
         DuagError: nothing of the kind is there, a line is not understood, or the graph is two-dimensional.
     """
-    path = Path(path)  # a text will do
+    path = Path(path)
     edges, files, ignored = _read(path)
     names = sorted({key[0] for key in (*edges.i, *edges.j)})
     if names == [""]:

@@ -18,7 +18,7 @@ from duagc.schemas import topics
 class Recording:
     """A folder with one log per robot and a `recording.json` that says what they are."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str | Path) -> None:
         """Read the description of a recording; its logs are opened when they are asked for.
 
         Args:

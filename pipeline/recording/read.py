@@ -94,7 +94,7 @@ hand_down(_known, _learn)
 class LogFile:
     """An MCAP file that has been verified, with its summary in hand."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str | Path) -> None:
         """Verify a log and read its summary.
 
         Args:
@@ -273,7 +273,7 @@ class LogFile:
         return self._chunks[start]
 
 
-def read_log(path: Path, topics: str | Topic | Iterable[str | Topic] | None = None) -> Iterator[Record]:
+def read_log(path: str | Path, topics: str | Topic | Iterable[str | Topic] | None = None) -> Iterator[Record]:
     """Yield the messages of a log, ordered by log time and then by position in the file.
 
     Args:

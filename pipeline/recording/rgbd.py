@@ -65,7 +65,7 @@ class RgbdLog:
     that), `shutter` (of `open_shutter`). Keeps few frames.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str | Path) -> None:
         """Open a log; `open_rgbd` does the same.
 
         Args:
@@ -212,13 +212,14 @@ class RgbdLog:
         """
         self.shutter = OpenShutter(shutter_s, self.motion_along(*parts)) if shutter_s > 0 else None
 
-    def move_depth_by(self, frontend: Path, path: Trajectory | None = None) -> None:
+    def move_depth_by(self, frontend: str | Path, path: Trajectory | None = None) -> None:
         """`delay_depth`, `readout`, `move_depth` and `open_shutter` by what the front end found.
 
         Args:
             frontend: frontend.mcap of the robot.
             path: T_map_camera of the frames that it tracked; None: read if they are needed.
         """
+        frontend = Path(frontend)
         self.delay_depth(depth_delay_ns(frontend))
         self.readout = self._stated_readout or Readout.found(frontend) or Readout()
         shutter_s = found_shutter_s(frontend)
@@ -385,7 +386,7 @@ class RgbdLog:
         return mask if self.valid is None else mask & self.valid
 
 
-def open_rgbd(path: Path) -> RgbdLog:
+def open_rgbd(path: str | Path) -> RgbdLog:
     """Open the log of one robot's camera.
 
     Args:

@@ -47,7 +47,7 @@ class LogWriter:
     removed on any other. `digest` is the content digest once the writer is closed.
     """
 
-    def __init__(self, path: Path, robot: str = "", metadata: Mapping[str, str] | None = None) -> None:
+    def __init__(self, path: str | Path, robot: str = "", metadata: Mapping[str, str] | None = None) -> None:
         """Keep the path and the metadata; the file is opened when the context is entered.
 
         Args:

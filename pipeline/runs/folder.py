@@ -250,7 +250,7 @@ class RunFolder:
             raise DuagError(f"{path}: recording {named} not found; give --recording")
         return (self.path / named).resolve()
 
-    def recording_at(self, path: Path | None = None) -> Path:
+    def recording_at(self, path: str | Path | None = None) -> Path:
         """The recording that this run was made of, wherever it is now.
 
         Args:
@@ -259,7 +259,7 @@ class RunFolder:
         Raises:
             DuagError: it is not there, or another one, by the digests of its logs.
         """
-        path = path or self.recording
+        path = self.recording if path is None else Path(path)
         recording = Recording(path)
         for robot, expected in self._json("manifest.json").get("inputs", {}).items():
             log = recording.log(robot)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator
-from typing import Any
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 
@@ -37,6 +39,19 @@ def test_every_parameter_has_a_line(name: str) -> None:
     assert text
     section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.DOTALL | re.MULTILINE)
     assert (re.findall(r"^    (\w+):", section[1], re.MULTILINE) if section else []) == expected
+
+
+@pytest.mark.parametrize("name", duagc.__all__)
+def test_a_path_may_be_a_text(name: str) -> None:
+    """So that nobody has to know which of the public functions wants which."""
+    value = getattr(duagc, name)
+    methods = [f for of, f in FUNCTIONS.items() if of.partition(".")[0] == name]
+    if inspect.isclass(value) and "__init__" in vars(value) and not is_dataclass(value):
+        methods.append(value.__init__)
+    for function in methods:
+        for parameter in inspect.signature(function, eval_str=True).parameters.values():
+            kinds = get_args(parameter.annotation) or (parameter.annotation,)
+            assert Path not in kinds or str in kinds, parameter
 
 
 def test_there_are_about_forty_public_names_each_with_a_docstring() -> None:
