@@ -84,7 +84,7 @@ def _usage(command: Any) -> list[str]:
     for p in command.params:
         if p.param_type_name == "argument":
             name = (p.metavar or p.name or "").upper()
-            words.append(name if p.required else f"[{name}]")
+            words.append(name if p.required or name.startswith("[") else f"[{name}]")
     return words
 
 
@@ -97,6 +97,7 @@ def _parameter(p: Any) -> tuple[str, str, str]:
         name, default = (p.metavar or p.name).upper(), "required" if p.required else ""
     else:
         name, default = ", ".join((*p.opts, *p.secondary_opts)), "required" if p.required else _default(p)
+        name += f" {p.metavar}" if p.metavar else ""
     return f"`{name}`", default, cell(p.help or "")
 
 

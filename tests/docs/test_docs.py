@@ -187,6 +187,12 @@ def commands(page: Path) -> Iterator[list[str]]:
                 yield shlex.split(words)[1:]
 
 
+def test_the_reference_of_commands_says_what_a_value_looks_like() -> None:
+    text = (DOCS / "reference" / "cli.md").read_text(encoding="utf-8")
+    for option in ("--cover ROBOT:FIRST:FRAMES", "--gaussian ROBOT:ID", "--tile METERS", "--set a.b=VALUE"):
+        assert f"`{option}`" in text
+
+
 QUOTING = [page for page in [*CURRENT, *FRONT] if not (is_generated(page) and page.name == "api.md")]
 
 
