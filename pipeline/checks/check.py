@@ -76,6 +76,8 @@ def _remedy(log: Path | None) -> str:
     """What may help where a log cannot be read: of a sound one nothing is to be recovered."""
     if log is None or not log.is_file():
         return ""
+    if log.suffix in (".bag", ".db3"):
+        return "duagc convert ros makes a recording of it"
     try:
         verify(log)
     except DuagError:

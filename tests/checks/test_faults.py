@@ -349,6 +349,12 @@ def test_what_is_no_log_is_not_to_be_recovered(tmp_path: Path, content: bytes) -
     assert (finding.severity, finding.advice) == ("error", "")
 
 
+def test_a_log_of_ros_is_to_be_converted(tmp_path: Path) -> None:
+    (tmp_path / "alpha.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (finding,) = check.check(tmp_path / "alpha.bag").findings
+    assert (finding.severity, finding.advice) == ("error", "duagc convert ros makes a recording of it")
+
+
 def test_a_sound_log_without_a_camera_is_not_to_be_recovered(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "alpha.mcap", "alpha") as log:
         reading = m.pack_imu(0, "alpha", np.zeros(3), np.array([0.0, 0.0, 9.8]))
