@@ -118,7 +118,7 @@ class PeerValidationConfig(Config):
 
 
 class StatedScaleConfig(Config):
-    """The factor on the stated deviations of a fused map, at least 1: peers' Gaussians held against own depth."""
+    """The factor on the stated deviations of a fused map, at least 1: peers' Gaussians compared with own depth."""
 
     enabled: bool = True
     """Else deviations stay as each robot states them of its own Gaussians."""

@@ -28,7 +28,7 @@ def section(robot: RobotRun) -> dict[str, Any]:
     if len(robot.component) < 2:
         reason = Absent("this robot met no other robot")
     elif first == robot.robot:
-        reason = Absent("the others' cameras are held against this one")
+        reason = Absent("the others' cameras are compared with this one")
     else:
         reason = Absent("the run has not recorded how cameras differ")
     if seen is None:

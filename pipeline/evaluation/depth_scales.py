@@ -99,7 +99,7 @@ def section(robot: RobotRun, scales: Mapping[str, DepthScale]) -> dict[str, floa
     if len(robot.component) < 2:
         reason = "this robot met no other robot"
     elif robot.component[0] == robot.robot:
-        reason = "the others' cameras are held against this one"
+        reason = "the others' cameras are compared with this one"
     else:
         reason = "too few loop closures with the first robot have features in common"
     return dict.fromkeys(names, Absent(reason))

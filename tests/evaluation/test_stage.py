@@ -48,7 +48,7 @@ def test_peers_views_are_compared_in_the_colors_of_their_camera(metrics, tmp_pat
     assert seen["robots"]["bravo"]["camera"]["gain_green"] == pytest.approx(0.6)
     assert seen["robots"]["bravo"]["camera"]["matches"] == 500
     assert seen["robots"]["alpha"]["camera"]["gain_green"] is None
-    assert "held against" in reason_of(seen["reasons"], "robots.alpha.camera.gain_green")
+    assert "compared with" in reason_of(seen["reasons"], "robots.alpha.camera.gain_green")
     for robot in ("alpha", "bravo"):  # as if nobody had found out
         log = dark.run / "robots" / robot / "fused.mcap"
         records = [(r.topic, r.message(), r.log_time_ns) for r in read_log(log)]
