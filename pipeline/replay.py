@@ -20,7 +20,7 @@ from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import ROBOT_RESULTS, digest_file
-from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.runs.folder import RunFolder, written
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def replay(
     config = load_config(RunConfig, RunFolder(run).config_file)
     logs = Recording(Path(recording))
     known = RunFolder(run).robots
-    check_file(run / "exchange.mcap", "the log of the exchange")
+    check_file(written(run / "exchange.mcap"), "the log of the exchange")
     for robot in robots:  # before hours of work
         if robot not in known:
             raise DuagError(f"{run}: robot {robot} not found, expected one of {', '.join(known)}")

@@ -128,7 +128,7 @@ def test_results_of_other_settings_do_not_stay_in_a_run(
     assert {name.split(".")[0] for name in stages_in(out)} == {"frontend", "information", "exchange"}
     assert any("left out results of other settings or inputs: metrics.json and" in line for line in lines)
     assert "refined.ply" not in printed
-    assert_one_line(duagc_here("evaluate", out), "trajectory.tum: No such file")
+    assert_one_line(duagc_here("evaluate", out), "trajectory.tum: not found; `duagc run`")
     assert_one_line(duagc_here("report", out), "metrics.json: not found")
 
 

@@ -30,7 +30,7 @@ from duagc.pipeline.exchange.record import RUNNING_KINDS
 from duagc.pipeline.messages.parts import unpack_stamp
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.recording import Record, read_log
-from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.runs.folder import RunFolder, written
 from duagc.schemas import topics
 
 Series = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
@@ -161,9 +161,7 @@ class Session:
 
     def _records(self, name: str, *of: topics.Topic) -> Iterator[Record]:
         """The records of all robots on some topics, in order of the log."""
-        path = self.run.path / name
-        if not path.is_file():
-            raise DuagError(f"{path}: not found, expected the log of the exchange")
+        path = written(self.run.path / name)
         return read_log(path, topics=[topic.of(robot) for topic in of for robot in self.run.robots])
 
     def _log(self, name: str, topic: topics.Topic) -> list[Any]:

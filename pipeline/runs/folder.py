@@ -50,6 +50,20 @@ TIMES = ("wall_s", "cpu_s", "peak_rss_mb")
 METRICS_SCHEMA = 2  # of metrics.json; 1 had a reason for every name, and other names of loop closures
 
 
+def written(path: Path) -> Path:
+    """A result of a run, which may have been stopped before the stage that writes it.
+
+    Args:
+        path: of the file, in the folder of the run.
+
+    Raises:
+        DuagError: it is not there.
+    """
+    if not path.is_file():
+        raise DuagError(f"{path}: not found; `duagc run` without --until writes it")
+    return path
+
+
 @dataclass(frozen=True)
 class RobotRun:
     """The results of one robot; files are read when they are asked for, and once.
@@ -144,7 +158,7 @@ class RobotRun:
 
     def _trajectory(self, file: str) -> Trajectory:
         """A log has checksums of its own; of a text file only the manifest knows what was written."""
-        path = self.folder / file
+        path = written(self.folder / file)
         trajectory = read_tum(path)
         if file in self.digests and (found := digest_file(path)) != self.digests[file]:
             raise DuagError(
@@ -153,9 +167,7 @@ class RobotRun:
         return trajectory
 
     def _all(self, file: str, topic: topics.Topic) -> list[Any]:
-        path = self.folder / file
-        if not path.is_file():
-            raise DuagError(f"{path}: not found; run the stages that write it first")
+        path = written(self.folder / file)
         return [SHELF.put(r.message()) for r in read_log(path, topics=[topic.of(self.robot)])]
 
     def _last(self, file: str, topic: topics.Topic) -> Any:

@@ -27,7 +27,7 @@ from duagc.pipeline.network.packets import (
 )
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.report import labels
-from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.runs.folder import RunFolder, written
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, theta_of
 from duagc.schemas import topics
 
@@ -48,10 +48,10 @@ class Inspector:
 
     @cached_property
     def _session(self) -> Recorded:
-        return read_session(self.run.path / "exchange.mcap")
+        return read_session(written(self.run.path / "exchange.mcap"))
 
     def _consensus(self, topic: topics.Topic, robot: str) -> list[Any]:
-        path = self.run.path / "consensus.mcap"
+        path = written(self.run.path / "consensus.mcap")
         return [record.message() for record in read_log(path, topics=[topic.of(robot)])]
 
     # --- one round

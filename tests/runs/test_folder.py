@@ -16,6 +16,7 @@ from duagc.pipeline.report import write_report
 from duagc.pipeline.runs.digest import ROBOT_RESULTS, TEAM_RESULTS, digest, result_files
 from duagc.pipeline.runs.folder import RunFolder
 from tests.fixtures import fake_run
+from tests.fixtures.commands import assert_one_line, duagc_here
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +71,30 @@ def test_a_replay_misses_results_before_it_computes_any(whole: fake_run.FakeRun,
     with pytest.raises(DuagError, match=r"robots/alpha/fused.ply: No such file"):
         replay(run, whole.recording, ["alpha"], said.append)
     remove_exchange(run)
-    with pytest.raises(DuagError, match=r"exchange.mcap: No such file"):
+    with pytest.raises(DuagError, match=r"exchange.mcap: not found; `duagc run` without --until writes it"):
         replay(run, whole.recording, ["alpha"], said.append)
     assert said == []
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (("inspect", "--loop-closures"), "consensus.mcap"),
+        (("inspect", "--round", "0"), "exchange.mcap"),
+        (("evaluate",), "robots/alpha/trajectory.tum"),
+        (("export", "--out", "{tmp}/maps"), "robots/alpha/fused.mcap"),
+    ],
+)
+def test_a_run_that_was_stopped_before_a_stage_says_what_goes_on(
+    whole: fake_run.FakeRun, tmp_path: Path, command: tuple[str, ...], name: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole.run, run)
+    (run / name).unlink()
+    words = [word.format(tmp=tmp_path) for word in command[1:]]
+    there = ("--recording", whole.recording) if command[0] == "evaluate" else ()
+    result = duagc_here(command[0], run, *words, *there)
+    assert_one_line(result, f"{name}: not found; `duagc run` without --until writes it")
 
 
 def test_a_run_that_is_not_there_says_so(tmp_path: Path) -> None:
