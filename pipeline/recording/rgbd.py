@@ -219,8 +219,7 @@ class RgbdLog:
             frontend: frontend.mcap of the robot.
             path: T_map_camera of the frames that it tracked; None: read if they are needed.
         """
-        frontend = Path(frontend)
-        self.delay_depth(depth_delay_ns(frontend))
+        self.delay_depth(depth_delay_ns(frontend := Path(frontend)))
         self.readout = self._stated_readout or Readout.found(frontend) or Readout()
         shutter_s = found_shutter_s(frontend)
         if self.needs_motion or shutter_s > 0:

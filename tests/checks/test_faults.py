@@ -342,28 +342,6 @@ def test_logs_that_cannot_be_read_are_findings(sound: Path, tmp_path: Path) -> N
     assert "nothing found" in result.stdout
 
 
-@pytest.mark.parametrize("content", [b"", b"not a log at all" * 10])
-def test_what_is_no_log_is_not_to_be_recovered(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "alpha.mcap").write_bytes(content)
-    (finding,) = check.check(tmp_path / "alpha.mcap").findings
-    assert (finding.severity, finding.advice) == ("error", "")
-
-
-def test_a_log_of_ros_is_to_be_converted(tmp_path: Path) -> None:
-    (tmp_path / "alpha.bag").write_bytes(b"#ROSBAG V2.0\n")
-    (finding,) = check.check(tmp_path / "alpha.bag").findings
-    assert (finding.severity, finding.advice) == ("error", "duagc convert ros makes a recording of it")
-
-
-def test_a_sound_log_without_a_camera_is_not_to_be_recovered(tmp_path: Path) -> None:
-    with LogWriter(tmp_path / "alpha.mcap", "alpha") as log:
-        reading = m.pack_imu(0, "alpha", np.zeros(3), np.array([0.0, 0.0, 9.8]))
-        log.write(topics.IMU.of("alpha"), reading, 0)
-    (finding,) = [f for f in check.check(tmp_path / "alpha.mcap").findings if f.severity == "error"]
-    assert "expected exactly one robot" in finding.line()
-    assert finding.advice == "duagc info says what is in it"
-
-
 def test_an_odometry_tells_the_scale(sound: Path, tmp_path: Path) -> None:
     """Without ground truth, poses of another sensor contradict a wrong depth scale."""
     poses = list(read_log(sound / "bravo.groundtruth.mcap", [topics.GROUNDTRUTH_POSE.of("bravo")]))
