@@ -79,8 +79,9 @@ class BearingMatches:
     def of(first: Features, second: Features, ratio: float) -> BearingMatches | None:
         """Matches of all features.
 
-        None: features without depth were not looked for in both views, too few match and move, or most have depth in
-        both views.
+        Of matches between the same two places one counts: a blob of several orientations has several. None: features
+        without depth were not looked for in both views, too few match and move, or most of those have depth in both
+        views, and so have most pixels.
 
         Args:
             first: features of the first view.
@@ -93,11 +94,12 @@ class BearingMatches:
         pairs = matches(ours, theirs, ratio)
         (a, rho_a), (b, rho_b) = _places(first, pairs[:, 0]), _places(second, pairs[:, 1])
         backward = np.isnan(rho_a) & ~np.isnan(rho_b)
-        if len(pairs) < MIN_INLIERS or np.count_nonzero(~np.isnan(rho_a + rho_b)) > len(pairs) / 2:
-            return None
         pixel = max(first.bearings.pixel, second.bearings.pixel)
-        left = np.flatnonzero(_moving(np.linalg.norm(a - b, axis=1) / pixel))
-        if not len(left):
+        left = _once(a, b)
+        left = left[_moving(np.linalg.norm(a - b, axis=1)[left] / pixel)]
+        few = first.bearings.few_depths or second.bearings.few_depths
+        in_both = np.count_nonzero(~np.isnan(rho_a + rho_b)[left])
+        if len(left) < MIN_INLIERS or (in_both > len(left) / 2 and not few):
             return None
         order = left[np.argsort(backward[left], kind="stable")]
         return BearingMatches(
@@ -250,6 +252,12 @@ def _moving(moved_px: Array) -> NDArray[np.bool_]:
     return moving if far else np.full_like(moving, count > len(moving) / 2)
 
 
+def _once(a: Array, b: Array) -> NDArray[np.int64]:
+    """The first [k] of all matches [n] between the same places [n, 3]: of a blob that has several orientations."""
+    _, first = np.unique(np.concatenate([a[:, :2], b[:, :2]], axis=1), axis=0, return_index=True)
+    return np.sort(first)
+
+
 def _places(features: Features, index: NDArray[np.int64]) -> tuple[Array, Array]:
     """Where a view has features, [n, 3] at a depth of 1, and their inverse depth [n], NaN where it is unknown."""
     points, rays = features.points.astype(np.float64), features.bearings.rays.astype(np.float64)
@@ -302,49 +310,62 @@ class _Residuals:
         unit, rho = _segments(matched, far, along)
         unknown = np.isnan(matched.inverse_depth)
         is_open = unknown & (rho > 0) & (rho < LARGEST_INVERSE_DEPTH)
+        impossible = unknown & (rho >= LARGEST_INVERSE_DEPTH)
         rho = np.where(unknown, np.clip(rho, 0.0, LARGEST_INVERSE_DEPTH), matched.inverse_depth)
         q = far + rho[..., None] * along
         behind = q[..., 2] < NEAREST
         z = np.where(behind, 1.0, q[..., 2])
         place = q[..., :2] / z[..., None]
         moved = place - far[..., :2] / np.maximum(far[..., 2:], NEAREST)
-        by_depth = np.hypot(
-            1.0, DEPTH_SIGMA / LEAST_SIGMA_PX / matched.pixel * np.linalg.norm(moved, axis=-1)
-        )
+        by_depth = np.hypot(1.0, DEPTH_SIGMA / LEAST_SIGMA_PX / matched.pixel * _length(moved))
         share = np.where(is_open, 0.0, np.where(unknown, 1.0, 1 / by_depth))
-        jacobian = _derivatives(matched, R, place, z, rho=rho)
         axes = np.stack([np.stack([-unit[..., 1], unit[..., 0]], axis=-1), share[..., None] * unit], axis=-2)
         axes /= matched.pixel
-        residual = (axes @ (place - matched.sought)[..., None])[..., 0]
-        jacobian = axes @ jacobian
-        impossible = behind | (unknown & (rho >= LARGEST_INVERSE_DEPTH))
+        off = place - matched.sought
+        residual = axes[..., 0] * off[..., :1] + axes[..., 1] * off[..., 1:]
+        by_place = _derivatives(matched, R, place, z, rho=rho)
+        jacobian = axes[..., :1] * by_place[..., :1, :] + axes[..., 1:] * by_place[..., 1:, :]
+        impossible |= behind
         residual[impossible], jacobian[impossible] = OFF_PX, 0.0
-        return _Residuals(residual, jacobian, np.linalg.norm(residual, axis=-1), is_open)
+        return _Residuals(residual, jacobian, _length(residual), is_open)
+
+
+def _length(vectors: Array) -> Array:
+    """Of vectors [..., 2]."""
+    return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2)
 
 
 def _segments(matched: BearingMatches, far: Array, along: Array) -> tuple[Array, Array]:
     """Directions [s, n, 2] in which places move with the inverse depth, and inverse depths [s, n] that fit best."""
     direction = along[..., :2] * far[..., 2:] - far[..., :2] * along[..., 2:]
-    length = np.linalg.norm(direction, axis=-1, keepdims=True)
+    length = _length(direction)[..., None]
     unit = np.where(length > 1e-12, direction / np.maximum(length, 1e-12), [1.0, 0.0])
-    at = np.sum(unit * matched.sought, axis=-1)
-    top = at * far[..., 2] - np.sum(unit * far[..., :2], axis=-1)
-    bottom = np.sum(unit * along[..., :2], axis=-1) - at * along[..., 2]
+    u, v = unit[..., 0], unit[..., 1]
+    at = u * matched.sought[:, 0] + v * matched.sought[:, 1]
+    top = at * far[..., 2] - (u * far[..., 0] + v * far[..., 1])
+    bottom = u * along[..., 0] + v * along[..., 1] - at * along[..., 2]
     fits = np.abs(bottom) > 1e-9
     return unit, np.where(fits, top / np.where(fits, bottom, 1.0), 0.0)
 
 
 def _derivatives(matched: BearingMatches, R: Array, place: Array, z: Array, *, rho: Array) -> Array:
     """Of places [s, n, 2], z times nearer than their inverse depths, by the right tangents, [s, n, 2, 6]."""
-    k, (x, y) = matched.forward, (place[..., 0], place[..., 1])
-    one, none = np.ones_like(x), np.zeros_like(x)
-    by_point = np.stack([np.stack([one, none, -x], axis=-1), np.stack([none, one, -y], axis=-1)], axis=-2)
-    seen = np.stack([x, y, one], axis=-1)[:, :k, None]
-    turned, given = by_point[:, k:] @ R[:, None], matched.given[k:, None]
+    k, x, y = matched.forward, place[..., 0], place[..., 1]
+    nearness = rho / z
     J = np.empty((*x.shape, 2, 6))
-    J[:, :k, :, :3] = -by_point[:, :k]
-    J[:, k:, :, :3] = turned
-    J[..., :3] *= (rho / z)[..., None, None]
-    J[:, :k, :, 3:] = np.cross(by_point[:, :k], seen)
-    J[:, k:, :, 3:] = np.cross(given, turned) / z[:, k:, None, None]
+    rows = np.empty((*x.shape, 2, 3))  # by the point, z times
+    rows[..., 0, 0] = rows[..., 1, 1] = 1.0
+    rows[..., 0, 1] = rows[..., 1, 0] = 0.0
+    np.negative(place, out=rows[..., 2])
+    J[:, :k, :, :3] = -nearness[:, :k, None, None] * rows[:, :k]
+    # the cross products of these rows and (x, y, 1)
+    x, y, turn = x[:, :k], y[:, :k], J[:, :k, :, 3:]
+    turn[..., 0, 0], turn[..., 0, 1], turn[..., 0, 2] = x * y, -x * x - 1.0, y
+    turn[..., 1, 0], turn[..., 1, 1], turn[..., 1, 2] = 1.0 + y * y, -x * y, -x
+    if k < len(matched):
+        turned, (a, b, c) = rows[:, k:] @ R[:, None], matched.given[k:].T[..., None]
+        J[:, k:, :, :3] = nearness[:, k:, None, None] * turned
+        p, q, r = np.moveaxis(turned, -1, 0)
+        J[:, k:, :, 3:] = np.stack([b * r - c * q, c * p - a * r, a * q - b * p], axis=-1)
+        J[:, k:, :, 3:] /= z[:, k:, None, None]
     return J

@@ -12,7 +12,12 @@ T_FIRST_SECOND = se3.exp(np.array([0.07, -0.02, 0.05, 0.02, -0.06, 0.03]))
 
 
 def two_views(
-    depth_in: tuple[float, float], *, noise_px: float = 0.2, wrong: float = 0.0, seed: int = 0
+    depth_in: tuple[float, float],
+    *,
+    noise_px: float = 0.2,
+    wrong: float = 0.0,
+    seed: int = 0,
+    few_depths: bool = True,
 ) -> tuple[Features, Features]:
     """Views of the same 160 points, each with the depth of some; some seen elsewhere by the second one."""
     rng = np.random.default_rng(seed)
@@ -28,7 +33,7 @@ def two_views(
         if len(views):
             rays[moved, :2] += rng.uniform(-0.3, 0.3, (int(moved.sum()), 2))
         known = rng.random(count) < share
-        bearings = Bearings(descriptors[~known], rays[~known].astype(np.float32), PIXEL, True)
+        bearings = Bearings(descriptors[~known], rays[~known].astype(np.float32), PIXEL, few_depths)
         with_depth = (rays * points[:, 2:])[known].astype(np.float32)
         views.append(Features(descriptors[known], with_depth, bearings))
     return views[0], views[1]
@@ -113,8 +118,31 @@ def test_views_that_were_not_looked_at_for_bearings_say_nothing() -> None:
 
 
 def test_matches_with_depth_in_both_views_decide_by_themselves() -> None:
-    assert BearingMatches.of(*two_views((0.9, 0.9)), 0.8) is None
-    assert BearingMatches.of(*two_views((0.9, 0.3)), 0.8) is not None
+    assert BearingMatches.of(*two_views((0.9, 0.9), few_depths=False), 0.8) is None
+    assert BearingMatches.of(*two_views((0.9, 0.3), few_depths=False), 0.8) is not None
+
+
+def test_where_few_pixels_have_depth_all_matches_count() -> None:
+    """Of a street above a hood most features have depth, but dense registration few samples."""
+    motion = motion_from_bearings(matched(two_views((0.9, 0.9))), [np.eye(4)])
+    assert motion.matches == 160
+    assert se3.distance(T_FIRST_SECOND, motion.T_first_second)[0] < 0.006
+
+
+def test_a_blob_of_several_orientations_counts_once() -> None:
+    """One that was taken for another decides where the camera is if it counts as often as it has orientations."""
+    rng, orientations = np.random.default_rng(8), 60
+    first, second = two_views((0.0, 0.0))
+    blob = np.tile(np.float32([0.4, 0.3, 1.0]), (orientations, 1))
+    descriptors = rng.integers(120, 250, (orientations, 128), dtype=np.uint8)
+
+    def with_blob(view: Features, rays: np.ndarray) -> Features:
+        own = view.bearings
+        more = np.concatenate([own.descriptors, descriptors]), np.concatenate([own.rays, rays])
+        return Features(view.descriptors, view.points, Bearings(*more, PIXEL, few_depths=True))
+
+    elsewhere = blob + np.float32([0.1, 0.05, 0.0])
+    assert len(matched((with_blob(first, blob), with_blob(second, elsewhere)))) == 161
 
 
 def test_few_matches_and_wrong_ones_alone_are_no_motion() -> None:
@@ -137,12 +165,14 @@ def test_a_body_that_moves_with_the_camera_does_not_count(body: int) -> None:
             np.concatenate([view.bearings.descriptors, descriptors]),
             np.concatenate([view.bearings.rays, rays]),
             PIXEL,
-            few_depths=True,
+            few_depths=view.bearings.few_depths,
         )
         return Features(view.descriptors, view.points, own)
 
     first, second = (with_body(view) for view in two_views((0.3, 0.3)))
     motion = motion_from_bearings(matched((first, second)), [np.eye(4)])
     assert motion.matches <= 160
+    others = (with_body(view) for view in two_views((0.9, 0.9), few_depths=False))
+    assert BearingMatches.of(*others, 0.8) is None, "the body has no depth, most of what moves has it"
     assert se3.distance(T_FIRST_SECOND, motion.T_first_second)[0] < 0.006
     assert BearingMatches.of(first, first, 0.8) is None
