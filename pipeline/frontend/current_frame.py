@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels
 from duagc.pipeline.registration import Level, Registration, RgbdPyramid
-from duagc.pipeline.registration.features import Features, extract_from_pyramid, has_few_depths
+from duagc.pipeline.registration.features import Detections, Features, extract_from_pyramid, has_few_depths
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class CurrentFrame:
         hidden: what an object in front of the camera hides, which the images are without; None: nothing known.
         whole: its coarsest image before.
         suspected: what an object may hide, of a frame with whole images; None: nothing.
+        detections: keypoints of its images, for the frame without some pixels, too.
     """
 
     frame_index: int
@@ -37,6 +38,7 @@ class CurrentFrame:
     hidden: HiddenPixels | None = None
     whole: Level | None = None
     suspected: HiddenPixels | None = None
+    detections: Detections = field(default_factory=Detections)
 
     @property
     def seen(self) -> Level:
@@ -65,7 +67,7 @@ class CurrentFrame:
     @cached_property
     def features(self) -> Features:
         """Its features; computed when first needed."""
-        return features_of(self.pyramid, self.relocalization)
+        return features_of(self.pyramid, self.relocalization, self.detections)
 
     @cached_property
     def has_few_depths(self) -> bool:
@@ -73,14 +75,17 @@ class CurrentFrame:
         return has_few_depths(self.pyramid)
 
 
-def features_of(pyramid: RgbdPyramid, config: RelocalizationConfig) -> Features:
+def features_of(
+    pyramid: RgbdPyramid, config: RelocalizationConfig, before: Detections | None = None
+) -> Features:
     """The features by which a frame is relocalized, and to which it is compared as a keyframe.
 
     Args:
         pyramid: images of the frame.
         config: number of features and size of the image.
+        before: what was found in images of the frame; None: nothing.
     """
-    return extract_from_pyramid(pyramid, config.max_width_px, config.features)
+    return extract_from_pyramid(pyramid, config.max_width_px, config.features, before=before)
 
 
 @dataclass(frozen=True)

@@ -197,10 +197,11 @@ def _detected(
     place: Callable[[Array], Array] = lambda pixels: pixels,
     *,
     all_of_them: bool = False,
+    before: Detections | None = None,
 ) -> _Detected:
     """Twice as many keypoints as are wanted, or all, if there are too few usable ones among those."""
     for limit in (0,) if all_of_them else (2 * most, 0):
-        found = _Detected.of(image, limit, place)
+        found = _Detected.of(image, limit, place) if before is None else before.of(image, limit)
         u, v = found.pixels.T
         if np.count_nonzero(usable(u, v, found.sizes)) >= most or len(found.sizes) < limit:
             break
@@ -250,6 +251,25 @@ class _Detected:
         return Keypoints(root_sift(self.sift[order]), self.pixels[order], self.responses[order])
 
 
+class Detections:
+    """What SIFT found in the images of a frame: where pixels are left out of it, its image stays the same."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[int, bytes], _Detected] = {}
+
+    def of(self, image: NDArray[np.uint8], limit: int) -> _Detected:
+        """`_Detected.of`, or what it returned before.
+
+        Args:
+            image: uint8 [h, w].
+            limit: how many, about; 0: all.
+        """
+        key = limit, image.tobytes()
+        if key not in self._found:
+            self._found[key] = _Detected.of(image, limit)
+        return self._found[key]
+
+
 def brightened(gray: NDArray[np.uint8], usable: masks.Mask) -> NDArray[np.uint8]:
     """The image, or two, four, ... times as bright if it is dark: features are found from a fixed contrast on.
 
@@ -265,7 +285,9 @@ def brightened(gray: NDArray[np.uint8], usable: masks.Mask) -> NDArray[np.uint8]
     return gray if factor == 1 else np.minimum(gray.astype(np.uint16) * factor, 255).astype(np.uint8)
 
 
-def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> Features:
+def extract_from_pyramid(
+    pyramid: RgbdPyramid, max_width_px: int, most: int, *, before: Detections | None = None
+) -> Features:
     """`extract` from the finest image of a pyramid that is not wider than a limit, or the coarsest if all are.
 
     Features without depth are kept, too: where less than half of the image has depth, of all that there are. An image
@@ -275,22 +297,21 @@ def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> 
         pyramid: of the view.
         max_width_px: the limit.
         most: number of features kept.
+        before: what was found in the frame; None: nothing. What is found now is added.
     """
     levels = pyramid.levels
     at = next((k for k, of in enumerate(levels) if of.camera.width <= max_width_px), len(levels) - 1)
-    small = levels[at].camera.width * levels[at].camera.height < LEAST_PX
-    level = levels[at - 1 if at and small else at]
+    level = levels[at - 1 if at and levels[at].gray.size < LEAST_PX else at]
     gray = np.rint(np.clip(level.gray, 0, 1) * 255).astype(np.uint8)
     depth_m = inverse_or_zero(level.inverse_depth)
     known = depth_m > 0 if level.mask is None else (depth_m > 0) & level.mask
     few, image = has_few_depths(pyramid), brightened(gray, known)
     from_masked_px = None if level.mask is None else masks.distance_px(level.mask)
     with_depth, without = (_usable(where, from_masked_px) for where in (depth_m > 0, depth_m == 0))
-    found = _detected(image, most, with_depth, all_of_them=few)
+    found = _detected(image, most, with_depth, all_of_them=few, before=before)
     features = _with_depth(found.strongest(most, with_depth), depth_m, level.camera)
     others = found.strongest(most, without)
-    u, v = others.pixels.T
-    rays = back_project(level.camera, u, v, np.ones(len(u))).astype(np.float32)
+    rays = _with_depth(others, np.ones_like(depth_m), level.camera).points
     return replace(features, bearings=Bearings(others.descriptors, rays, 1 / level.camera.fx, few))
 
 

@@ -12,14 +12,17 @@ from duagc.pipeline.frontend import bearing_registration, bundle, feature_checks
 from duagc.pipeline.frontend.current_frame import PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
+from duagc.pipeline.frontend.hidden_pixels import HiddenPixels
 from duagc.pipeline.frontend.nearby_registration import register_nearby
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid
+from duagc.pipeline.registration.features import extract_from_pyramid
 from tests.fixtures.films import CAMERA
 from tests.frontend.conftest import CONFIG
 
+FEATURES = CONFIG.tracking.relocalization.max_width_px, CONFIG.tracking.relocalization.features
 FAR_M = 3.6  # in a room whose depth is 3.8 to 4.4 m in the median
 
 
@@ -95,6 +98,24 @@ def test_the_joint_optimization_knows_of_features_without_depth(
     with_bearings_m = optimized_m()
     monkeypatch.setattr(bundle.BearingMatches, "of", lambda *_: None)
     assert with_bearings_m < min(0.006, 0.9 * optimized_m())
+
+
+def test_an_image_is_searched_once_for_features_of_a_frame_without_some_pixels(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shot = with_holes(run.shots[0], FAR_M - 0.4, 0.35)
+    frame = Tracker(CAMERA, CONFIG).prepared(
+        RgbdImages(frame_index=1, stamp_ns=0, image=shot.color, depth_m=shot.depth)
+    )
+    mask = np.zeros(frame.pyramid.levels[-1].gray.shape, bool)
+    mask[:, :20] = True
+    clear = frame.without(HiddenPixels(mask, 0.2, 1.0))
+    alone = extract_from_pyramid(clear.pyramid, *FEATURES)
+    assert len(frame.features)
+    monkeypatch.setattr(cv2.SIFT, "create", None)
+    for one, other in ((clear.features, alone), (clear.features.bearings, alone.bearings)):
+        np.testing.assert_array_equal(one.descriptors, other.descriptors)
+    assert 0 < len(alone.bearings.rays) < len(frame.features.bearings.rays)
 
 
 def test_holes_that_wander_leave_features_in_one_view_or_the_other(
