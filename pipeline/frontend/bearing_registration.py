@@ -10,6 +10,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import TrackingConfig
 from duagc.pipeline.frontend.current_frame import CurrentFrame
 from duagc.pipeline.registration import Reference, Registration, RegistrationConfig, RgbdPyramid, register
+from duagc.pipeline.registration.bearing_judgment import bearings_contradict
 from duagc.pipeline.registration.bearing_motion import BearingMatches, bearings_at, motion_from_bearings
 from duagc.pipeline.registration.features import Features
 
@@ -65,7 +66,8 @@ def register_by_bearings(
 ) -> Registration | None:
     """A registration from the motion that bearings agree on, which it does not leave; its information is of both.
 
-    None: features with depth decide, too few bearings agree, or they do not agree with what was found.
+    None: features with depth decide, too few bearings agree, or they do not agree with what was found, or those without
+    depth contradict it.
 
     Args:
         view: that the other one is registered to.
@@ -85,6 +87,7 @@ def register_by_bearings(
         view.reference, pyramid, motion.T_first_second, config, prior_information=motion.information
     )
     there = bearings_at(matched, result.T_reference_target)
-    if not result.ok or there.sigma_px > MOST_SPREAD * motion.sigma_px:
+    spread = there.sigma_px > MOST_SPREAD * motion.sigma_px
+    if not result.ok or spread or bearings_contradict(matched, result.T_reference_target):
         return None
     return replace(result, information=result.information + there.information)

@@ -10,6 +10,8 @@ from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.judgment import contradicts
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.bearing_judgment import bearings_contradict
+from duagc.pipeline.registration.bearing_motion import BearingMatches
 from duagc.pipeline.registration.feature_judgment import judge_motion
 from duagc.pipeline.registration.feature_motion import features_agree, follows_something_moved
 
@@ -91,6 +93,28 @@ class FeaturesDoNotContradict:
         T, rng = candidate.result.T_reference_target, _draws("frame_judgment", frame, candidate)
         found = judge_motion(features, frame.features, T, config=limits, rng=rng)
         return Reason.OBSTRUCTED if found is not None and contradicts(found, limits) else candidate
+
+
+class BearingsDoNotContradict:
+    """Where few pixels have depth, features without it must not say that the camera moved otherwise."""
+
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
+        """Reject it if features without depth agree on another motion.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well; by bearings they were asked.
+        """
+        first = state.keyframes[candidate.keyframe_index].features
+        if candidate.by_bearings or not (frame.has_few_depths or first.bearings.few_depths):
+            return candidate
+        matched = BearingMatches.of(first, frame.features, frame.relocalization.ratio)
+        T = candidate.result.T_reference_target
+        contradicted = matched is not None and bearings_contradict(matched, T)
+        return Reason.OBSTRUCTED if contradicted else candidate
 
 
 class FeaturesAllowWorseLook:

@@ -16,6 +16,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
 from duagc.pipeline.frontend.feature_checks import (
+    BearingsDoNotContradict,
     DoesNotFollowMovedThings,
     FeaturesAllowWorseLook,
     FeaturesConfirm,
@@ -283,6 +284,7 @@ FOLLOWED: tuple[PoseCheck, ...] = (
     MatchesPrediction(),
     DepthColorConsistency(),
     FeaturesAllowWorseLook(),
+    BearingsDoNotContradict(),
 )
 """Checks of a frame that was registered from where it was predicted."""
 
@@ -292,6 +294,7 @@ PLAUSIBLE: tuple[PoseCheck, ...] = (
     RespectsFreeSpace(),
     WithinReach(),
     FeaturesConfirm(),
+    BearingsDoNotContradict(),
 )
 """Checks of a pose that was not simply followed."""
 
@@ -306,6 +309,7 @@ FOUND_BY_FEATURES: tuple[PoseCheck, ...] = (
     WithinReach(),
     FeaturesConfirm(),
     FeaturesDoNotContradict(),
+    BearingsDoNotContradict(),
 )
 """Checks of a pose that was found from matched features, whose descriptors say that it looks alike: far from its
 keyframe a frame overlaps little, and its gray values fit less well than from near."""
@@ -323,5 +327,6 @@ FOUND_FROM_ALL_AROUND: tuple[PoseCheck, ...] = (
     RespectsFreeSpace(),
     WithinReach(),
     FeaturesDoNotContradict(),
+    BearingsDoNotContradict(),
 )
 """Checks of a pose that registrations from all around the prediction lead to."""

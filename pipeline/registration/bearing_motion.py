@@ -168,6 +168,16 @@ def bearings_at(matched: BearingMatches, T_first_second: Array) -> BearingMotion
     return BearingMotion(T_first_second, information, len(matched), agree, sigma_px)
 
 
+def distances_px(matched: BearingMatches, T_first_second: Array) -> Array:
+    """How far matches are from where a motion has them, [n], pixels.
+
+    Args:
+        matched: of two views.
+        T_first_second: [4, 4], the motion.
+    """
+    return _Residuals.at(matched, T_first_second[None]).off_px[0]
+
+
 def _refined(
     matched: BearingMatches, T_first_second: Array, lengths_m: Array, scales_px: Sequence[float | None]
 ) -> Array:

@@ -142,3 +142,16 @@ def test_holes_that_wander_leave_features_in_one_view_or_the_other(
     assert se3.distance(state.in_map(found), T_map_map @ run.poses[4 * last])[0] < 0.005
     monkeypatch.setattr(bearing_registration.BearingMatches, "of", lambda *_: None)
     assert register_nearby(state, frame) is Reason.LOW_OVERLAP
+
+
+def test_a_pose_that_features_without_depth_contradict_is_not_good(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However it was found: by bearings, from the prediction, or from features."""
+    shots = filmed(run, 4, FAR_M, 0.35)
+    tracker, _ = tracked(shots[:5])
+    for module in (bearing_registration, feature_checks):
+        monkeypatch.setattr(module, "bearings_contradict", lambda *_: True)
+    assert track(tracker, shots[5])[0].status is Status.LOST
+    monkeypatch.undo()
+    assert track(tracker, shots[6])[0].status is Status.RELOCALIZED
