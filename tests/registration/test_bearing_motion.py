@@ -1,5 +1,7 @@
 """Motions that matched features agree on where most of them have no depth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,23 @@ def test_depth_in_either_view_and_bearings_determine_the_motion(
     assert turned_rad < 0.002
 
 
+def test_depth_whose_noise_grows_with_the_distance_counts_by_it() -> None:
+    """As of a stereo pair: what is near says how far the camera went, and what is far says little."""
+
+    def wrong_by_m(noise: float, seed: int) -> float:
+        rng, noisy = np.random.default_rng(seed), []
+        for view in two_views((0.4, 0.4), seed=seed):
+            points = view.points.astype(np.float64)
+            depth_m = 1 / np.maximum(1 / points[:, 2] + 0.06 * rng.standard_normal(len(points)), 0.05)
+            points = (points * (depth_m / points[:, 2])[:, None]).astype(np.float32)
+            noisy.append(Features(view.descriptors, points, replace(view.bearings, noise=noise)))
+        motion = motion_from_bearings(matched((noisy[0], noisy[1])), [np.eye(4)])
+        return float(se3.distance(T_FIRST_SECOND, motion.T_first_second)[0])
+
+    stated, unstated = ([wrong_by_m(noise, seed) for seed in range(12)] for noise in (0.06, 0.0))
+    assert np.mean(stated) < 0.8 * np.mean(unstated)
+
+
 def test_without_any_depth_the_way_is_as_long_as_it_was_taken_to_be() -> None:
     matches = matched(two_views((0.0, 0.0)))
     T = T_FIRST_SECOND.copy()
@@ -96,7 +115,7 @@ def test_of_the_motions_that_a_wall_leaves_open_the_true_one_is_found(seed: int)
     first = se3.transform(T, second)
     given, sought = first / first[:, 2:], second[:, :2] / second[:, 2:]
     sought = sought + 0.2 * PIXEL * rng.normal(size=sought.shape)
-    matches = BearingMatches(given, sought, np.full(150, np.nan), 150, PIXEL)
+    matches = BearingMatches(given, sought, np.full(150, np.nan), np.full(150, np.nan), 150, PIXEL)
     starts = [se3.exp(0.05 * rng.normal(size=6) + np.array([0, 0, 0.03, 0, 0, 0])) for _ in range(2)]
     found = motion_from_bearings(matches, starts)
     assert se3.distance(T, found.T_first_second)[1] < 0.002
@@ -149,7 +168,7 @@ def test_few_matches_and_wrong_ones_alone_are_no_motion() -> None:
     first, second = two_views((0.0, 0.0))
     few = Bearings(second.bearings.descriptors[:15], second.bearings.rays[:15], PIXEL, True)
     assert BearingMatches.of(first, Features(second.descriptors, second.points, few), 0.8) is None
-    behind = BearingMatches(np.ones((40, 3)), np.full((40, 2), -1e6), np.full(40, np.nan), 40, PIXEL)
+    behind = BearingMatches(np.ones((40, 3)), np.full((40, 2), -1e6), *[np.full(40, np.nan)] * 2, 40, PIXEL)
     assert not motion_from_bearings(behind, [np.eye(4)]).accepted
 
 
