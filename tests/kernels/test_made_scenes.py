@@ -74,6 +74,21 @@ def test_many_thousands_on_one_pixel(scene, depth):
     assert_agreement(scene, depth)
 
 
+@pytest.mark.parametrize("isa", available_isas())
+def test_a_closed_pixel_stays_closed_next_to_one_that_is_hardly_covered(isa: str) -> None:
+    """Every Gaussian is blended in the pixels in which it is blended when each of them is drawn alone."""
+    camera, rasterizer = PinholeCamera(4, 1, 8.0, 8.0, 0.5, 0.5), Rasterizer(isa)
+    for seed in range(24):
+        scene = crowded_scene(seed, 600, camera)
+        view = scene.gaussians, scene.camera, scene.T_camera_map
+        rasterizer.forward(*view)
+        pixels, alone = rasterizer.contributions()[1].copy(), np.zeros(600, np.int64)
+        for mask in np.eye(4, dtype=bool)[:, None]:
+            rasterizer.forward(*view, mask=mask)
+            alone += rasterizer.contributions()[1]
+        np.testing.assert_array_equal(pixels, alone)
+
+
 def kinds() -> list:
     """All shapes, places, opacities and depths; `make test` takes so many that every two of them meet."""
     every = itertools.product(*map(enumerate, (SHAPES, PLACES, OPACITIES, DEPTH_KINDS)))

@@ -70,12 +70,6 @@ struct NoMemory {
     float least() const { return TRANSMITTANCE_MIN; }
     void keep(uint32_t, Vec, Vec) const {}
 };
-// Adds the weights up.
-struct WeightSum : NoMemory {
-    Vec* sum;
-    explicit WeightSum(Vec& to) : sum(&to) {}
-    void keep(uint32_t, Vec, Vec weight) const { *sum += weight; }
-};
 // As Memory, where the Gaussian that takes a pixel below `closing` stops all of its light: it is blended with an alpha of 1.
 struct ClosingMemory : Memory {
     static constexpr bool CLOSES = true;
@@ -186,17 +180,30 @@ ALWAYS_INLINE inline Vec alpha_of(const OpenBlock& image, Mask wanted, SumOfWeig
     const Mask little = wanted & (alpha < Vec(0.5f));
     return any(little) ? select(little, sum_of_weights(), alpha) : alpha;
 }
-// The sum, front to back, of the weights of a block's items: of those that a memory kept, or by blending what was blended once more.
+// The sum, front to back, of the weights of a block's items: of those that a memory kept, or by blending once more, in the same pixels,
+// what was blended: a Gaussian that only closed pixels is no item, so light does not say here which pixels are closed.
 inline Vec sum_of_kept(const float* weights, uint32_t count) {
     Vec sum(0.0f);
     for (uint32_t k = 0; k < count; k++) sum += load(weights + static_cast<size_t>(k) * LANES);
     return sum;
 }
-template <DepthKind KIND>
-inline Vec sum_of_blended(const Splat* splats, const TileItems items, uint32_t count, uint32_t unseen, OpenBlock block) {
-    Vec sum(0.0f);
-    uint64_t evaluated = 0;  // counted already
-    blend_candidates<KIND>(splats, items, count, unseen, WeightSum(sum), block, evaluated);
+inline Vec sum_of_blended(const Splat* splats, const TileItems items, uint32_t count, const OpenBlock& block) {
+    Vec sum(0.0f), left = block.left;
+    for (uint32_t first = 0; first < count; first += ABREAST) {
+        Vec alpha[ABREAST], rest[ABREAST];
+        unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
+            const uint32_t item = first + k < count ? first + k : first;
+            const Splat& s = splats[items.positions[item]];
+            alpha[k] = Whitened(s, block.pixel_x, block.pixel_y).log2_alpha(s);
+            alpha_and_rest(alpha[k], mask_of_bits(item == first + k ? items.pixels[item] : 0u), rest[k]);
+            pin(alpha[k]);
+            pin(rest[k]);
+        });
+        unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
+            sum += alpha[k] * left;
+            left = left * rest[k];
+        });
+    }
     return sum;
 }
 

@@ -47,7 +47,7 @@ inline void draw_tile(Frame& frame, int index, const Images& images) {
         const Vec alpha = alpha_of(image, wanted, [&] {
             const uint32_t count = items.counts[b];
             if constexpr (LAYERED) return sum_of_kept(memory.weights, count);
-            else return sum_of_blended<KIND>(splats, blended, count, tile.count, OpenBlock(block, wanted));
+            else return sum_of_blended(splats, blended, count, OpenBlock(block, wanted));
         });
         const Vec rgb[3] = {select_or_zero(wanted, fma(image.T, background[0], image.R)),
                             select_or_zero(wanted, fma(image.T, background[1], image.G)),
