@@ -173,7 +173,9 @@ def loss_outputs(
         wanted = rgbd_loss(render, color, depth_m, LOSS, exposure=EXPOSURE, mask=options["mask"])
         cotangents = wanted.d_color, wanted.d_depth, wanted.d_alpha
     out: Outputs = {"loss": (np.array([loss.value, loss.color, loss.depth]), IMAGE_BAR, 0.0)}
-    out["loss by exposure"] = (np.array(loss.d_exposure), GRADIENT_BAR, ROUNDING)  # means of slopes up to 1
+    # means of slopes, each a difference of two colors in widths of the loss: these are the terms that cancel
+    floor = ROUNDING / LOSS.color_huber
+    out["loss by exposure"] = (np.array(loss.d_exposure), GRADIENT_BAR, floor)
     out.update(gradient_outputs("loss by", rasterizer, gradients, cotangents, floors))
     return out
 
