@@ -21,6 +21,8 @@ from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 Descriptors = NDArray[np.uint8]
+Usable = Callable[[Array, Array, Array], NDArray[np.bool_]]
+Placed = Callable[[Array], Array]
 DIMENSIONS = 128
 LEAST_PX = 50_000  # of the image that features are looked for in
 DARK, DARK_PERCENT = 100, 99  # gray value that one pixel in a hundred of a well exposed image exceeds
@@ -173,10 +175,7 @@ NO_KEYPOINTS = Keypoints(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 2)), 
 
 
 def strongest_keypoints(
-    image: NDArray[np.uint8],
-    most: int,
-    usable: Callable[[Array, Array, Array], NDArray[np.bool_]],
-    place: Callable[[Array], Array] = lambda pixels: pixels,
+    image: NDArray[np.uint8], most: int, usable: Usable, place: Placed = lambda pixels: pixels
 ) -> Keypoints:
     """The strongest keypoints of an image that are usable.
 
@@ -195,8 +194,8 @@ def strongest_keypoints(
 def _detected(
     image: NDArray[np.uint8],
     most: int,
-    usable: Callable[[Array, Array, Array], NDArray[np.bool_]],
-    place: Callable[[Array], Array] = lambda pixels: pixels,
+    usable: Usable,
+    place: Placed = lambda pixels: pixels,
     *,
     all_of_them: bool = False,
     before: Detections | None = None,
@@ -229,9 +228,7 @@ class _Detected:
     sizes: Array
 
     @staticmethod
-    def of(
-        image: NDArray[np.uint8], limit: int, place: Callable[[Array], Array] = lambda pixels: pixels
-    ) -> _Detected:
+    def of(image: NDArray[np.uint8], limit: int, place: Placed = lambda pixels: pixels) -> _Detected:
         """The strongest, about so many; 0: all."""
         import cv2
 
@@ -243,7 +240,7 @@ class _Detected:
         responses, angles, sizes = np.array([(k.response, k.angle, k.size) for k in keypoints]).T
         return _Detected(np.asarray(sift, np.float32), pixels, responses, angles, sizes)
 
-    def strongest(self, most: int, usable: Callable[[Array, Array, Array], NDArray[np.bool_]]) -> Keypoints:
+    def strongest(self, most: int, usable: Usable) -> Keypoints:
         """The strongest that are usable, as of `strongest_keypoints`."""
         if not len(self.sizes):
             return NO_KEYPOINTS
