@@ -27,7 +27,7 @@ import numpy as np
 
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels import FisherSums, Gradients, LossWeights, Rasterizer
+from duagc.pipeline.kernels import FisherSums, Gradients, LossWeights, Rasterizer, Render
 from duagc.pipeline.kernels.reference_rounding import RoundingReference
 from duagc.pipeline.splat.information import unpack_geometry
 from duagc.pipeline.splat.losses import rgbd_loss
@@ -167,15 +167,15 @@ def loss_outputs(
         pose=True,
         **options,
     )
-    cotangents: tuple[Any, ...] = ()
-    if floors:
-        render = rasterizer.forward(*view, scene.background, **options)
-        wanted = rgbd_loss(render, color, depth_m, LOSS, exposure=EXPOSURE, mask=options["mask"])
-        cotangents = wanted.d_color, wanted.d_depth, wanted.d_alpha
+    # of the image that was drawn: slopes are differences of colors, in which errors within its bar grow
+    render = rasterizer.forward(*view, scene.background, **options)
+    exact = Render(*(image.astype(np.float64) for image in vars(render).values()))
+    wanted = rgbd_loss(exact, color, depth_m, LOSS, exposure=EXPOSURE, mask=options["mask"])
+    cotangents = (wanted.d_color, wanted.d_depth, wanted.d_alpha) if floors else ()
     out: Outputs = {"loss": (np.array([loss.value, loss.color, loss.depth]), IMAGE_BAR, 0.0)}
-    # means of slopes, each a difference of two colors in widths of the loss: these are the terms that cancel
-    floor = ROUNDING / LOSS.color_huber
-    out["loss by exposure"] = (np.array(loss.d_exposure), GRADIENT_BAR, floor)
+    off = np.array(loss.d_exposure) - np.array(wanted.d_exposure)
+    limit = max(GRADIENT_BAR * float(np.linalg.norm(wanted.d_exposure)), ROUNDING)  # means of slopes up to 1
+    out["loss by exposure"] = (off, 0.0, limit)
     out.update(gradient_outputs("loss by", rasterizer, gradients, cotangents, floors))
     return out
 
