@@ -16,7 +16,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.current_frame import CurrentFrame
 from duagc.pipeline.frontend.matching_keyframes import most_matching
 from duagc.pipeline.frontend.tracking_state import TrackingState
-from duagc.pipeline.registration.feature_motion import motion_from_features
+from duagc.pipeline.registration.feature_motion import FeatureMotion, motion_from_features
 
 
 def initial_motions(state: TrackingState, frame: CurrentFrame) -> Iterator[tuple[int, Array]]:
@@ -33,12 +33,12 @@ def initial_motions(state: TrackingState, frame: CurrentFrame) -> Iterator[tuple
         Keyframe index and T_keyframe_camera [4, 4].
     """
     for k in _keyframes(state, frame):
-        if (motion := initial_motion(state, frame, k)) is not None:
+        if (motion := feature_motion(state, frame, k).accepted_motion) is not None:
             yield k, motion
 
 
-def initial_motion(state: TrackingState, frame: CurrentFrame, keyframe_index: int) -> Array | None:
-    """T_keyframe_camera [4, 4] that matched features agree on; None: on none.
+def feature_motion(state: TrackingState, frame: CurrentFrame, keyframe_index: int) -> FeatureMotion:
+    """The motion that matched features of a keyframe and a frame agree on.
 
     Args:
         state: what the tracker knows.
@@ -48,8 +48,7 @@ def initial_motion(state: TrackingState, frame: CurrentFrame, keyframe_index: in
     # the draws only choose which samples are tried: the same in every run
     rng = random_streams.generator(0, "initialization", frame=frame.frame_index, keyframe=keyframe_index)
     features, config = state.keyframes[keyframe_index].features, state.config.tracking.relocalization
-    found = motion_from_features(features, frame.features, config, rng)
-    return found.accepted_motion
+    return motion_from_features(features, frame.features, config, rng)
 
 
 def _keyframes(state: TrackingState, frame: CurrentFrame) -> Iterator[int]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
 
 import numpy as np
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import TrackingConfig
 from duagc.pipeline.frontend.bearing_registration import register_by_bearings
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.feature_initialization import initial_motion, initial_motions
+from duagc.pipeline.frontend.feature_initialization import feature_motion, initial_motions
 from duagc.pipeline.frontend.pose_checks import (
     FOLLOWED,
     FOUND_BY_BEARINGS,
@@ -26,6 +27,7 @@ from duagc.pipeline.frontend.prediction import Prediction
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.statistics import CHI2_6_MEDIAN
 from duagc.pipeline.registration import Outcome, Registration, RegistrationConfig, register
 
 REACH_SIGMAS = 3.0
@@ -72,14 +74,19 @@ def _looking_as_usual(state: TrackingState, frame: CurrentFrame, found: PoseCand
     """What was found, or where features have the frame, if only there it looks as usual, or it fits better there.
 
     A registration that went farther from the prediction than it converges from may have ended in a wrong minimum that
-    looks as usual, too.
+    looks as usual, too: unless features have the frame no farther from there than they are uncertain.
     """
-    usual, only = _looks_as_usual(state, found), None
+    usual, motions = _looks_as_usual(state, found), None
     if usual:
         if not went_far(state, frame, found):
             return found
-        only = found.keyframe_index  # residuals tell which of the minima of one keyframe is deeper
-    for candidate in _from_features(state, frame, state.config.tracking, only=only):
+        index = found.keyframe_index  # residuals tell which of the minima of one keyframe is deeper
+        motion = feature_motion(state, frame, index)
+        T = motion.accepted_motion
+        if T is None or motion.chi2(found.result.T_reference_target) < CHI2_6_MEDIAN:
+            return found
+        motions = ((index, T),)
+    for candidate in _from_features(state, frame, state.config.tracking, motions):
         other = verify(FOUND_NEARBY, state, frame, candidate)
         if isinstance(other, PoseCandidate) and (
             (not usual and _looks_as_usual(state, other)) or fits_better(state, other, found)
@@ -262,15 +269,13 @@ def _from_all_around(
 
 
 def _from_features(
-    state: TrackingState, frame: CurrentFrame, tracking: TrackingConfig, *, only: int | None = None
+    state: TrackingState,
+    frame: CurrentFrame,
+    tracking: TrackingConfig,
+    motions: Iterable[tuple[int, Array]] | None = None,
 ) -> Iterator[PoseCandidate]:
-    """Registrations by some settings from the motions that features agree on; to `only` one keyframe."""
-    if only is None:
-        motions = initial_motions(state, frame)
-    else:
-        motion = initial_motion(state, frame, only)
-        motions = iter(() if motion is None else ((only, motion),))
-    for index, guess in motions:
+    """Registrations by some settings from motions, keyframes each with T_keyframe_camera; None: `initial_motions`."""
+    for index, guess in initial_motions(state, frame) if motions is None else motions:
         result = register_until_stable(
             state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
         )

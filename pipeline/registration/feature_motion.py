@@ -58,6 +58,16 @@ class FeatureMotion:
         assert self.T_first_second is not None
         return information_of_fit(self.partners, self.points, self.T_first_second)
 
+    def chi2(self, T_first_second: Array) -> float:
+        """Squared distance of another motion from an accepted one, in units of its covariance.
+
+        Args:
+            T_first_second: [4, 4], the other motion.
+        """
+        assert self.T_first_second is not None
+        apart = se3.log(se3.inverse(self.T_first_second) @ T_first_second)
+        return float(apart @ self.information @ apart)
+
 
 def motion_from_features(
     first: Features, second: Features, config: GeometricVerificationConfig, rng: np.random.Generator

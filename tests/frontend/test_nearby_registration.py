@@ -8,7 +8,7 @@ import pytest
 
 from duagc.pipeline import registration
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
-from duagc.pipeline.frontend import feature_checks, nearby_registration, reach
+from duagc.pipeline.frontend import feature_checks, nearby_registration, reach, stable_registration
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
@@ -111,6 +111,24 @@ def test_a_frame_far_from_its_prediction_is_where_it_fits_best_though_it_looks_a
     off_by(0.02, 1.3, monkeypatch)
     found = distance_m(run, state, nearby_registration.register_nearby(state, frame))
     assert found == pytest.approx(off_m, abs=2e-3)
+
+
+@pytest.mark.parametrize(("off_m", "asked"), [(0.0, 0), (0.02, 1)])
+def test_a_frame_far_from_its_prediction_is_registered_again_unless_features_have_it_there(
+    run: Undisturbed, monkeypatch: pytest.MonkeyPatch, off_m: float, asked: int
+) -> None:
+    state, frame = prepared(run)
+    monkeypatch.setattr(nearby_registration, "went_far", lambda state, frame, found: True)
+    again = []
+
+    def register_until_stable(*arguments, **options):
+        again.append(arguments)
+        return stable_registration.register_until_stable(*arguments, **options)
+
+    monkeypatch.setattr(nearby_registration, "register_until_stable", register_until_stable)
+    off_by(off_m, 1.0 + 15 * off_m, monkeypatch)
+    assert distance_m(run, state, nearby_registration.register_nearby(state, frame)) < 2e-3
+    assert len(again) == asked
 
 
 @pytest.mark.parametrize(("sigma_px", "off_m"), [(1.0, 0.02), (2.0, 0.0)])
