@@ -246,7 +246,7 @@ def free_space_violations(
         level.camera,
         gate_m=config.free_space_gate_m,
         gate_relative=config.free_space_gate_relative,
-        gate_inverse=chance_difference(level.noise, keyframe.noise),
+        gate_inverse=chance_difference(level.inverse_depth_sigma, keyframe.inverse_depth_sigma),
     )
     return int(np.count_nonzero(where == FREE)), int(np.count_nonzero(where != UNKNOWN))
 

@@ -71,9 +71,9 @@ def hidden_pixels(
     T_views_map = se3.inverse(np.reshape([T_map_view for _, T_map_view in seen], (-1, 4, 4)))
     views = [(level, T_view_map) for (level, _), T_view_map in zip(seen, T_views_map, strict=True)]
     some = (v % 2 == 0) & (u % 2 == 0)
-    votes = _votes(points_map[some], view.noise, views, config)
+    votes = _votes(points_map[some], view.inverse_depth_sigma, views, config)
     if np.count_nonzero(votes.is_free) >= least / 8:  # half as many as of a region that is large enough
-        votes = _votes(points_map, view.noise, views, config)
+        votes = _votes(points_map, view.inverse_depth_sigma, views, config)
     if np.count_nonzero(votes.is_free) < least:
         return HiddenPixels(np.zeros(view.inverse_depth.shape, bool), 0.0, votes.visible)
     is_free, is_surface = np.zeros(inverse_depth.shape, bool), np.zeros(inverse_depth.shape, bool)
@@ -108,9 +108,12 @@ class _Votes:
 
 
 def _votes(
-    points_map: Array, noise: float, views: Sequence[tuple[Level, Array]], config: FrontendConfig
+    points_map: Array,
+    inverse_depth_sigma: float,
+    views: Sequence[tuple[Level, Array]],
+    config: FrontendConfig,
 ) -> _Votes:
-    """What earlier views, each with T_view_map [4, 4], say of points [n, 3] in the map, meters; noise as of `Level`."""
+    """What earlier views, each with T_view_map [4, 4], say of points [n, 3] in the map, meters; sigma as of `Level`."""
     n = len(points_map)
     free, there, judged = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, bool)
     for level, T_view_map in views:
@@ -121,7 +124,7 @@ def _votes(
             level.camera,
             gate_m=config.tracking.registration.depth_gate_m,
             gate_relative=config.tracking.registration.depth_gate_relative,
-            gate_inverse=chance_difference(noise, level.noise),
+            gate_inverse=chance_difference(inverse_depth_sigma, level.inverse_depth_sigma),
         )
         free += where == FREE
         there += where == ON_SURFACE

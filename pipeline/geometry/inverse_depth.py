@@ -22,7 +22,7 @@ def inverse_or_zero(values: NDArray[Any]) -> NDArray[Any]:
     return np.where(known, one / np.where(known, values, one), values.dtype.type(0))
 
 
-def inverse_depth_noise(inverse_depth: NDArray[Any], sigma_m: NDArray[Any] | None = None) -> float:
+def inverse_depth_sigma(inverse_depth: NDArray[Any], sigma_m: NDArray[Any] | None = None) -> float:
     """Standard deviation of the inverse depth of the farther half of the known pixels, 1/m; 0 where too few are known.
 
     By its second differences along rows and columns, which are 0 on planes, or as stated, whichever is larger. It is
@@ -53,10 +53,10 @@ def _second_differences(inverse_depth: NDArray[Any], far: NDArray[np.bool_]) -> 
     return (before - 2 * inverse_depth[:, 1:-1] + after)[usable]
 
 
-def chance_difference(*noise: float) -> float:
+def chance_difference(*inverse_depth_sigmas: float) -> float:
     """By how much inverse depths of one surface differ at most by their noise, 1/m.
 
     Args:
-        noise: standard deviation of each, 1/m.
+        inverse_depth_sigmas: standard deviation of each, 1/m.
     """
-    return CHANCE_SIGMAS * float(np.sqrt(sum(sigma * sigma for sigma in noise)))
+    return CHANCE_SIGMAS * float(np.sqrt(sum(sigma * sigma for sigma in inverse_depth_sigmas)))

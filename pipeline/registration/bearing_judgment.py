@@ -33,7 +33,7 @@ def bearings_contradict(matched: BearingMatches, T_first_second: Array) -> bool:
     """
     import cv2
 
-    unknown, near = np.isnan(matched.inverse_depth), SHARED_SIGMA_PX * matched.pixel
+    unknown, near = np.isnan(matched.inverse_depth), SHARED_SIGMA_PX * matched.pixel_width
     with_given = distances_px(matched, T_first_second)[unknown] < FARTHER * SHARED_SIGMA_PX
     if np.count_nonzero(~with_given) < MIN_INLIERS:
         return False

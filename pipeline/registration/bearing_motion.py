@@ -64,7 +64,7 @@ class BearingMatches:
         inverse_depth: [n], 1/m, of `given`; NaN: unknown in either view.
         depth_sigma: [n], standard deviation of their depth, as a share of it; NaN: unknown.
         forward: how many come first.
-        pixel: width of a pixel at a depth of 1.
+        pixel_width: width of a pixel at a depth of 1.
     """
 
     given: Array
@@ -72,7 +72,7 @@ class BearingMatches:
     inverse_depth: Array
     depth_sigma: Array
     forward: int
-    pixel: float
+    pixel_width: float
 
     def __len__(self) -> int:
         return len(self.given)
@@ -90,29 +90,29 @@ class BearingMatches:
             second: features of the second view.
             ratio: of the ratio test.
         """
-        if min(first.bearings.pixel, second.bearings.pixel) == 0:
+        if min(first.bearings.pixel_width, second.bearings.pixel_width) == 0:
             return None
         ours, theirs = (np.concatenate([f.descriptors, f.bearings.descriptors]) for f in (first, second))
         pairs = matches(ours, theirs, ratio)
         (a, rho_a), (b, rho_b) = _places(first, pairs[:, 0]), _places(second, pairs[:, 1])
         backward = np.isnan(rho_a) & ~np.isnan(rho_b)
-        pixel = max(first.bearings.pixel, second.bearings.pixel)
+        pixel_width = max(first.bearings.pixel_width, second.bearings.pixel_width)
         left = _once(a, b)
-        left = left[_moving(np.linalg.norm(a - b, axis=1)[left] / pixel)]
+        left = left[_moving(np.linalg.norm(a - b, axis=1)[left] / pixel_width)]
         few = first.bearings.few_depths or second.bearings.few_depths
         in_both = np.count_nonzero(~np.isnan(rho_a + rho_b)[left])
         if len(left) < MIN_INLIERS or (in_both > len(left) / 2 and not few):
             return None
         order = left[np.argsort(backward[left], kind="stable")]
         inverse_depth = np.where(backward, rho_b, rho_a)
-        noise = np.where(backward, second.bearings.noise, first.bearings.noise)
+        sigma = np.where(backward, second.bearings.inverse_depth_sigma, first.bearings.inverse_depth_sigma)
         return BearingMatches(
             np.where(backward[:, None], b, a)[order],
             np.where(backward[:, None], a, b)[order, :2],
             inverse_depth[order],
-            np.maximum(DEPTH_SIGMA, noise / inverse_depth)[order],
+            np.maximum(DEPTH_SIGMA, sigma / inverse_depth)[order],
             int(np.count_nonzero(~backward[left])),
-            pixel,
+            pixel_width,
         )
 
 
@@ -239,7 +239,7 @@ def _by_plane(matched: BearingMatches, T_first_second: Array) -> Array:
     none = np.zeros((0, 4, 4))
     if len(given) < MIN_INLIERS:
         return none
-    H, _ = cv2.findHomography(given, sought, cv2.RANSAC, ON_PLANE_PX * matched.pixel)
+    H, _ = cv2.findHomography(given, sought, cv2.RANSAC, ON_PLANE_PX * matched.pixel_width)
     if H is None:
         return none
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
@@ -332,10 +332,10 @@ class _Residuals:
         z = np.where(behind, 1.0, q[..., 2])
         place = q[..., :2] / z[..., None]
         moved = place - far[..., :2] / np.maximum(far[..., 2:], NEAREST)
-        by_depth = np.hypot(1.0, matched.depth_sigma / LEAST_SIGMA_PX / matched.pixel * _length(moved))
+        by_depth = np.hypot(1.0, matched.depth_sigma / LEAST_SIGMA_PX / matched.pixel_width * _length(moved))
         share = np.where(is_open, 0.0, np.where(unknown, 1.0, 1 / by_depth))
         axes = np.stack([np.stack([-unit[..., 1], unit[..., 0]], axis=-1), share[..., None] * unit], axis=-2)
-        axes /= matched.pixel
+        axes /= matched.pixel_width
         off = place - matched.sought
         residual = axes[..., 0] * off[..., :1] + axes[..., 1] * off[..., 1:]
         by_place = _derivatives(matched, R, place, z, rho=rho)

@@ -37,16 +37,16 @@ class Bearings:
     Attributes:
         descriptors: uint8 [n, 128].
         rays: float32 [n, 3], camera frame, their z is 1.
-        pixel: width of a pixel at a depth of 1; 0: they were not looked for.
+        pixel_width: width of a pixel at a depth of 1; 0: they were not looked for.
         few_depths: whether most of the image has no depth.
-        noise: standard deviation of the inverse depth of what is far and has depth, 1/m.
+        inverse_depth_sigma: standard deviation of the inverse depth of what is far and has depth, 1/m.
     """
 
     descriptors: Descriptors
     rays: NDArray[np.float32]
-    pixel: float = 0.0
+    pixel_width: float = 0.0
     few_depths: bool = False
-    noise: float = 0.0
+    inverse_depth_sigma: float = 0.0
 
 
 NO_BEARINGS = Bearings(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 3), np.float32))
@@ -311,8 +311,8 @@ def extract_from_pyramid(
     features = _with_depth(found.strongest(most, with_depth), depth_m, level.camera)
     others = found.strongest(most, without)
     rays = _with_depth(others, np.ones_like(depth_m), level.camera).points
-    noise = levels[-1].noise
-    return replace(features, bearings=Bearings(others.descriptors, rays, 1 / level.camera.fx, few, noise))
+    sigma = levels[-1].inverse_depth_sigma
+    return replace(features, bearings=Bearings(others.descriptors, rays, 1 / level.camera.fx, few, sigma))
 
 
 def has_few_depths(pyramid: RgbdPyramid) -> bool:

@@ -34,7 +34,7 @@ class _View:
     T_map_camera: Array
     inverse_depth: Image
     nearest: Image  # largest inverse depth of 3x3 pixels
-    noise: float  # standard deviation of the inverse depth of what is far, 1/m
+    inverse_depth_sigma: float  # standard deviation of the inverse depth of what is far, 1/m
     center_map: Array
 
 
@@ -91,7 +91,7 @@ class FreeSpace:
                 self._small,
                 gate_m=self.config.gate_m,
                 gate_relative=self.config.gate_relative,
-                gate_inverse=chance_difference(view.noise, other.noise),
+                gate_inverse=chance_difference(view.inverse_depth_sigma, other.inverse_depth_sigma),
             )
             through += where == FREE
             there += where == ON_SURFACE
@@ -143,7 +143,7 @@ class FreeSpace:
         if len(v):
             center = np.median(back_project(self._small, u, v, 1 / small[v, u].astype(np.float64)), axis=0)
         T = np.array(T_map_camera, dtype=np.float64)
-        return _View(T, small, level.nearest, level.noise, se3.transform(T, center[None])[0])
+        return _View(T, small, level.nearest, level.inverse_depth_sigma, se3.transform(T, center[None])[0])
 
     def _nearest(self, view: _View) -> list[_View]:
         """The views that look at the nearest places, itself excepted."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.inverse_depth import inverse_depth_noise
+from duagc.pipeline.geometry.inverse_depth import inverse_depth_sigma
 from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
 from duagc.pipeline.geometry.scattered_holes import without_scattered_holes
 from duagc.pipeline.kernels import pyramid as compiled
@@ -82,9 +82,9 @@ class Level:
         return largest_of_3x3(self.inverse_depth)
 
     @cached_property
-    def noise(self) -> float:
+    def inverse_depth_sigma(self) -> float:
         """Standard deviation of the inverse depth of what is far, 1/m."""
-        return inverse_depth_noise(self.inverse_depth, self.depth_sigma_m)
+        return inverse_depth_sigma(self.inverse_depth, self.depth_sigma_m)
 
     @cached_property
     def normals(self) -> Image:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from duagc.pipeline.geometry.inverse_depth import chance_difference, inverse_depth_noise, inverse_or_zero
+from duagc.pipeline.geometry.inverse_depth import chance_difference, inverse_depth_sigma, inverse_or_zero
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
@@ -25,31 +25,31 @@ def ground(noise: float) -> np.ndarray:
 
 
 def test_noise_is_that_of_surfaces_whatever_stands_on_them() -> None:
-    assert inverse_depth_noise(ground(0.0)) < 1e-6
+    assert inverse_depth_sigma(ground(0.0)) < 1e-6
     for noise in (1e-3, 5e-3):
         found = ground(noise)
         found[::7, ::3] = 0
-        assert inverse_depth_noise(found) == pytest.approx(noise, rel=0.1)
+        assert inverse_depth_sigma(found) == pytest.approx(noise, rel=0.1)
 
 
 def test_noise_is_that_of_what_is_far() -> None:
     near, far = ground(0.02), ground(1e-3)
     whole = np.where(np.arange(60)[:, None] < 32, far, near)
-    assert inverse_depth_noise(whole) == pytest.approx(1e-3, rel=0.2)
+    assert inverse_depth_sigma(whole) == pytest.approx(1e-3, rel=0.2)
 
 
 def test_noise_is_no_less_than_stated() -> None:
     image = ground(1e-3)
     sigma_m = 0.01 / np.square(image)
-    assert inverse_depth_noise(image, sigma_m) == pytest.approx(0.01, rel=1e-4)
-    assert inverse_depth_noise(image, 1e-3 * sigma_m) == inverse_depth_noise(image)
+    assert inverse_depth_sigma(image, sigma_m) == pytest.approx(0.01, rel=1e-4)
+    assert inverse_depth_sigma(image, 1e-3 * sigma_m) == inverse_depth_sigma(image)
 
 
 def test_without_depth_no_noise_is_known() -> None:
-    assert inverse_depth_noise(np.zeros((6, 8), np.float32)) == 0.0
+    assert inverse_depth_sigma(np.zeros((6, 8), np.float32)) == 0.0
     alone = np.zeros((6, 8), np.float32)
     alone[3, 4] = 0.5
-    assert inverse_depth_noise(alone) == 0.0
+    assert inverse_depth_sigma(alone) == 0.0
 
 
 def test_depths_that_differ_by_chance_differ_by_their_noise() -> None:

@@ -64,17 +64,18 @@ def test_depth_in_either_view_and_bearings_determine_the_motion(
 def test_depth_whose_noise_grows_with_the_distance_counts_by_it() -> None:
     """As of a stereo pair: what is near says how far the camera went, and what is far says little."""
 
-    def wrong_by_m(noise: float, seed: int) -> float:
+    def wrong_by_m(sigma: float, seed: int) -> float:
         rng, noisy = np.random.default_rng(seed), []
         for view in two_views((0.4, 0.4), seed=seed):
             points = view.points.astype(np.float64)
             depth_m = 1 / np.maximum(1 / points[:, 2] + 0.06 * rng.standard_normal(len(points)), 0.05)
             points = (points * (depth_m / points[:, 2])[:, None]).astype(np.float32)
-            noisy.append(Features(view.descriptors, points, replace(view.bearings, noise=noise)))
+            bearings = replace(view.bearings, inverse_depth_sigma=sigma)
+            noisy.append(Features(view.descriptors, points, bearings))
         motion = motion_from_bearings(matched((noisy[0], noisy[1])), [np.eye(4)])
         return float(se3.distance(T_FIRST_SECOND, motion.T_first_second)[0])
 
-    stated, unstated = ([wrong_by_m(noise, seed) for seed in range(12)] for noise in (0.06, 0.0))
+    stated, unstated = ([wrong_by_m(sigma, seed) for seed in range(12)] for sigma in (0.06, 0.0))
     assert np.mean(stated) < 0.8 * np.mean(unstated)
 
 

@@ -108,7 +108,7 @@ def test_features_without_depth_are_kept_beside_those_with_depth(rows: int, few:
     assert has_few_depths(pyramid) == few
     found = extract_from_pyramid(pyramid, 400, 100)
     assert found.bearings.few_depths == few
-    assert found.bearings.pixel == pytest.approx(1 / CAMERA.fx)
+    assert found.bearings.pixel_width == pytest.approx(1 / CAMERA.fx)
     assert len(found) > 10
     assert len(found.bearings.rays) > 10
     points = found.points / found.points[:, 2:]
