@@ -178,7 +178,7 @@ class TrackingState:
             sigma_m = config.odometry_sigma_m + config.odometry_sigma_of_path * float(path_m)
             sigma_rad = config.odometry_sigma_rad + config.odometry_sigma_of_angle * float(angle_rad)
             return Prediction(last @ T, np.diag([sigma_m**-2.0] * 3 + [sigma_rad**-2.0] * 3))
-        sigma_rad = max(self._stated_gyro_sigma_rad(elapsed_s), self.gyro.sigma * elapsed_s)
+        sigma_rad = max(self._stated_gyro_sigma_rad(elapsed_s), self.gyro.sigma_rad_s * elapsed_s)
         predicted = last @ T
         predicted[:3, 3] = followed[:3, 3]
         information = np.diag([0.0] * 3 + [sigma_rad**-2.0] * 3)
@@ -210,11 +210,11 @@ class TrackingState:
         if motion is None or motion.knows_translation or elapsed_s <= 0:
             return
         turn = Turn(so3.log(motion.T_start_stop[:3, :3]) / elapsed_s, so3.log(R_last_camera) / elapsed_s)
-        stated_sigma = self._stated_gyro_sigma_rad(elapsed_s) / elapsed_s
-        if len(self.turns) >= FEWEST and self.gyro.is_still(turn, stated_sigma):
+        stated_sigma_rad_s = self._stated_gyro_sigma_rad(elapsed_s) / elapsed_s
+        if len(self.turns) >= FEWEST and self.gyro.is_still(turn, stated_sigma_rad_s):
             return  # a pause would push out the turns that tell how it is mounted
         self.turns = [*self.turns[1 - MOST :], turn]
-        self.gyro = GyroCorrection.of(self.turns, stated_sigma)
+        self.gyro = GyroCorrection.of(self.turns, stated_sigma_rad_s)
 
     def _deviation_px(self, elapsed_s: float, *, turns: bool) -> float:
         """By how much acceleration moves a view off its prediction, pixels of the coarsest image of a registration."""

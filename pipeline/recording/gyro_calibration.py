@@ -36,14 +36,14 @@ class GyroCorrection:
 
     Attributes:
         R_camera_gyro: [3, 3], rotation that the stated mounting lacks.
-        bias: [3], rad/s, in axes of the camera.
-        sigma: standard deviation of a corrected rate, each axis, rad/s; 0: not known.
+        bias_rad_s: [3], in axes of the camera.
+        sigma_rad_s: standard deviation of a corrected rate, each axis, rad/s; 0: not known.
         helps: whether corrected rates predict a turn better than the one before does.
     """
 
     R_camera_gyro: Array = field(default_factory=lambda: np.eye(3))
-    bias: Array = field(default_factory=lambda: np.zeros(3))
-    sigma: float = 0.0
+    bias_rad_s: Array = field(default_factory=lambda: np.zeros(3))
+    sigma_rad_s: float = 0.0
     helps: bool = True
 
     def corrected(self, R: Array, elapsed_s: float) -> Array:
@@ -53,27 +53,27 @@ class GyroCorrection:
             R: by the gyroscope.
             elapsed_s: the time.
         """
-        return np.asarray(so3.exp(self.R_camera_gyro @ so3.log(R) - self.bias * elapsed_s))
+        return np.asarray(so3.exp(self.R_camera_gyro @ so3.log(R) - self.bias_rad_s * elapsed_s))
 
-    def is_still(self, turn: Turn, stated_sigma: float) -> bool:
+    def is_still(self, turn: Turn, stated_sigma_rad_s: float) -> bool:
         """Whether neither sensor saw more of a turn than noise.
 
         Args:
             turn: between two frames.
-            stated_sigma: standard deviation of a rate that is expected, rad/s.
+            stated_sigma_rad_s: standard deviation of a rate that is expected, rad/s.
         """
-        rates = self.R_camera_gyro @ turn.by_gyro - self.bias, turn.by_images
-        return all(float(np.linalg.norm(rate)) < STILL_SIGMAS * stated_sigma for rate in rates)
+        rates = self.R_camera_gyro @ turn.by_gyro - self.bias_rad_s, turn.by_images
+        return all(float(np.linalg.norm(rate)) < STILL_SIGMAS * stated_sigma_rad_s for rate in rates)
 
     @staticmethod
-    def of(turns: Sequence[Turn], stated_sigma: float) -> GyroCorrection:
+    def of(turns: Sequence[Turn], stated_sigma_rad_s: float) -> GyroCorrection:
         """By the last turns; with few of them, none.
 
         The mounting is corrected only if the turns have more than one axis and agree far better with another one.
 
         Args:
             turns: in order of time.
-            stated_sigma: standard deviation of a rate that is expected, rad/s; a gyroscope that keeps it helps.
+            stated_sigma_rad_s: standard deviation of a rate that is expected, rad/s; a gyroscope that keeps it helps.
         """
         if len(turns) < FEWEST:
             return GyroCorrection()
@@ -83,9 +83,9 @@ class GyroCorrection:
         spread = np.linalg.svd(images - images.mean(axis=0), compute_uv=False)
         if spread[1] > LEAST_SPREAD * spread[0]:
             turned = _with_bias(_mounting(gyro, images), gyro, images)
-            found = turned if turned.sigma < REMOUNTED * found.sigma else found
+            found = turned if turned.sigma_rad_s < REMOUNTED * found.sigma_rad_s else found
         steady = _spread(np.diff(images, axis=0))
-        return found if found.sigma < max(steady, stated_sigma) else GyroCorrection(helps=False)
+        return found if found.sigma_rad_s < max(steady, stated_sigma_rad_s) else GyroCorrection(helps=False)
 
 
 def _mounting(gyro: Array, images: Array) -> Array:

@@ -121,7 +121,7 @@ class GyroPrior:
         first_ns, last_ns = min(start_ns, int(times_ns.min())), max(start_ns, int(times_ns.max()))
         if (used := self._used(first_ns, last_ns)) is None:
             return None
-        rates = self.rates_camera[used] @ correction.R_camera_gyro.T - correction.bias
+        rates = self.rates_camera[used] @ correction.R_camera_gyro.T - correction.bias_rad_s
         edges = self._edges(used, first_ns, last_ns)
         steps = so3.exp(rates * (1e-9 * np.diff(edges))[:, None])
         R_first_edge = np.array(list(accumulate(steps[:-1], np.matmul, initial=np.eye(3))))

@@ -29,8 +29,8 @@ def turns(count: int = 60, *, gyro=lambda rate: rate, axes: int = 3) -> list[Tur
 def test_a_bias_is_found() -> None:
     found = GyroCorrection.of(turns(gyro=lambda rate: rate + BIAS), STATED)
     np.testing.assert_array_equal(found.R_camera_gyro, np.eye(3))
-    np.testing.assert_allclose(found.bias, BIAS, atol=0.005)
-    assert 0.005 < found.sigma < 0.015
+    np.testing.assert_allclose(found.bias_rad_s, BIAS, atol=0.005)
+    assert 0.005 < found.sigma_rad_s < 0.015
     T = found.corrected(so3.exp(0.1 * (np.array([0.3, 0.0, -0.2]) + BIAS)), 0.1)
     np.testing.assert_allclose(so3.log(T), [0.03, 0.0, -0.02], atol=1e-3)
 
@@ -38,7 +38,7 @@ def test_a_bias_is_found() -> None:
 def test_a_wrong_mounting_is_found_with_its_bias() -> None:
     found = GyroCorrection.of(turns(gyro=lambda rate: MOUNTED.T @ (rate + BIAS)), STATED)
     np.testing.assert_allclose(found.R_camera_gyro, MOUNTED, atol=0.02)
-    np.testing.assert_allclose(found.bias, BIAS, atol=0.01)
+    np.testing.assert_allclose(found.bias_rad_s, BIAS, atol=0.01)
     assert found.helps
 
 
@@ -61,7 +61,7 @@ def test_what_no_mounting_explains_is_not_believed(gyro) -> None:
 def test_few_turns_correct_nothing() -> None:
     found = GyroCorrection.of(turns(FEWEST - 1, gyro=lambda rate: rate + BIAS), STATED)
     assert found.helps
-    assert not found.bias.any()
+    assert not found.bias_rad_s.any()
 
 
 def test_turns_that_neither_sensor_sees_are_still() -> None:
@@ -87,7 +87,7 @@ def test_a_pause_does_not_make_the_mounting_forgotten() -> None:
         state.motion = SimpleNamespace(between=lambda *_, T=T: Motion(T, knows_translation=False))
         state.compare_gyro(state.stamp_ns + 33_333_333, so3.exp(turn.by_images / 30))
     np.testing.assert_allclose(state.gyro.R_camera_gyro, MOUNTED, atol=0.05)
-    np.testing.assert_allclose(state.gyro.bias, BIAS, atol=0.02)
+    np.testing.assert_allclose(state.gyro.bias_rad_s, BIAS, atol=0.02)
 
 
 class Gyro:
@@ -121,5 +121,5 @@ def test_a_tracker_follows_a_walk_whatever_its_gyroscope_says() -> None:
             moved_m, turned_rad = se3.distance(se3.inverse(poses[0]) @ T, found)
             assert moved_m < 2e-3
             assert turned_rad < 2e-3
-        np.testing.assert_allclose(tracker.state.gyro.bias, bias, atol=0.03)
+        np.testing.assert_allclose(tracker.state.gyro.bias_rad_s, bias, atol=0.03)
         np.testing.assert_allclose(tracker.state.gyro.R_camera_gyro, R.T, atol=0.05)
