@@ -28,9 +28,9 @@ import numpy as np
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, Gradients, LossWeights, Rasterizer, Render
-from duagc.pipeline.kernels.reference_rounding import RoundingReference
 from duagc.pipeline.splat.information import unpack_geometry
 from duagc.pipeline.splat.losses import rgbd_loss
+from tests.kernels.rounding_reference import RoundingReference
 from tests.kernels.scenes import Scene
 
 PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")

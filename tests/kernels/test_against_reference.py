@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.kernels import FisherSums, Rasterizer, available_isas
-from duagc.pipeline.kernels.reference_rounding import RoundingReference
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS
 from duagc.pipeline.splat.information import unpack_geometry
+from tests.kernels.rounding_reference import RoundingReference
 from tests.kernels.scenes import KINDS, make_scene
 
 ISAS = available_isas()

@@ -9,7 +9,7 @@ import torch
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.kernels.autograd import rasterize
-from duagc.pipeline.kernels.reference_rounding import RoundingReference
+from tests.kernels.rounding_reference import RoundingReference
 from tests.kernels.scenes import make_scene
 
 PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")

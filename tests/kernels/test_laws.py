@@ -11,9 +11,9 @@ from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, Rasterizer
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
-from duagc.pipeline.kernels.reference_rounding import RoundingReference
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import unpack_geometry
+from tests.kernels.rounding_reference import RoundingReference
 from tests.kernels.scenes import BACKGROUND, make_scene, random_gaussians
 
 

@@ -1,4 +1,4 @@
-"""What rounding may do to what the reference computes; the tests of the compiled rasterizer allow for it."""
+"""What rounding may do to what the reference computes; tests of the compiled rasterizer allow for it."""
 
 from __future__ import annotations
 
