@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -97,6 +98,10 @@ def run(
         raise typer.BadParameter(f"{engine!r} is not one of local, slurm, ray", param_hint="--engine")
     if bool(names) == everything:
         raise typer.BadParameter("expected names of experiments, or --all", param_hint="NAME")
+    if repeated := [name for name, count in Counter(names or ()).items() if count > 1]:
+        raise typer.BadParameter(
+            f"found {', '.join(repeated)} more than once, expected every name once", param_hint="NAME"
+        )
     chosen = [read_experiment(name) for name in (experiment_names() if everything else names or [])]
     recordings = _named_folders(recording or ())
     for experiment in chosen:

@@ -151,6 +151,8 @@ def test_the_commands_name_what_there_is(tmp_path: Path) -> None:
     assert read_experiment("h1_team").sha256 in shown
     assert_one_line(duagc_here("experiment", "show", "h1_tean"), "expected perhaps h1_team")
     assert duagc_here("experiment", "run", "--out", tmp_path).returncode == 2
+    twice = duagc_here("experiment", "run", "h1_team", "compaction", "h1_team", "--out", tmp_path)
+    assert (twice.returncode, "h1_team more than once" in twice.stderr) == (2, True), twice.stderr
     assert_one_line(
         duagc_here("experiment", "run", "h1_team", "--profile", "medium", "--out", tmp_path), "small"
     )
