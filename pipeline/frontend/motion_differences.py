@@ -11,28 +11,20 @@ pairs: cameras that are turned against each other, or a wrong lens, are no time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.motion_times import MotionTimeConfig
 from duagc.pipeline.config.registration import RegistrationConfig
-from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.statistics import CHI2_6_MEDIAN, evenly_spaced
-from duagc.pipeline.geometry.trajectory import Trajectory
-from duagc.pipeline.recording import RgbdLog
+from duagc.pipeline.geometry.statistics import CHI2_6_MEDIAN
 from duagc.pipeline.registration import Outcome
 
-STEP_NS = 10_000_000  # in which a velocity is taken
 LEVELS = 4  # of pyramids; the finest is left out
 STRIDES = (4, 2, 1)
-FARTHEST_NS = 700_000_000  # between the frames of a pair
-MOST_OF_VIEW = 0.2  # of the width of the image that the view moves between them
-TYPICAL_DEPTH_M = 2.0  # at which a translation counts as a motion of the view
 MEASURED = (Outcome.OK, Outcome.ILL_CONDITIONED)  # directions that are not determined have no information
 BY_COLOR = RegistrationConfig(residuals="gray")
 BY_DEPTH = RegistrationConfig(residuals="depth")
@@ -86,62 +78,6 @@ class MotionDifference:
     information: Array
 
 
-@dataclass(frozen=True)
-class MovingView:
-    """A frame with its pose and velocity.
-
-    Attributes:
-        index: in the log.
-        stamp_ns: its time.
-        T_map_camera: [4, 4].
-        velocity: [6], right tangent, 1/s.
-    """
-
-    index: int
-    stamp_ns: int
-    T_map_camera: Array
-    velocity: Array
-
-    def pose_of(self, other: MovingView) -> Array:
-        """T_view_other [4, 4] of another view.
-
-        Args:
-            other: posed in the same map.
-        """
-        return np.asarray(se3.inverse(self.T_map_camera) @ other.T_map_camera)
-
-
-def view_pairs(
-    log: RgbdLog, parts: Sequence[Trajectory], count: int, quantile: float = 1.0
-) -> Iterator[tuple[MovingView, MovingView]]:
-    """Pairs of frames spread over a log, in order of time, between which the velocity changes most.
-
-    Args:
-        log: of the robot.
-        parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
-        count: about how many.
-        quantile: of the changes to the views near one, in that to which it is paired: 1: the largest.
-    """
-    views = [_views(log, part) for part in parts]
-    total = max(sum(len(part) for part in views), 1)
-    for part in views:
-        share = min(-(-count * len(part) // total), len(part))
-        for first in (part[k] for k in evenly_spaced(len(part), share)):
-            second = _changed(first, part, log.camera.fx, MOST_OF_VIEW * log.camera.width, quantile=quantile)
-            if second is not None:
-                yield first, second
-
-
-def has_sigma(log: RgbdLog) -> bool:
-    """Whether the log has sigma of its depth, pixel by pixel: depth that was computed from images or sweeps.
-
-    Args:
-        log: of the robot.
-    """
-    first = next((k for k, (_, depth) in enumerate(log.pairing.pairs) if depth is not None), None)
-    return first is not None and log.frame(first).depth_sigma is not None
-
-
 def joint_information(first: Array, second: Array) -> Array:
     """Information [6, 6] of the difference of two motions, by that of each.
 
@@ -152,17 +88,6 @@ def joint_information(first: Array, second: Array) -> Array:
     both = np.linalg.pinv(first + second, rcond=1e-9, hermitian=True)
     information = first @ both @ second
     return np.asarray(0.5 * (information + information.T))
-
-
-def change(T_first_second: Array, first: Array, second: Array) -> Array:
-    """Change [..., 6] of a velocity from one view to another, right tangent of the second.
-
-    Args:
-        T_first_second: [..., 4, 4].
-        first: [6], velocity of the first view.
-        second: [..., 6], that of the second.
-    """
-    return np.asarray(second - se3.adjoint(se3.inverse(T_first_second)) @ first)
 
 
 def estimated_time(found: Sequence[MotionDifference], config: MotionTimeConfig) -> FoundTime | None:
@@ -179,36 +104,6 @@ def estimated_time(found: Sequence[MotionDifference], config: MotionTimeConfig) 
     without = [_solve([*found[:a], *found[b:]], config)[0] for a, b in pairwise(ends)]
     jackknife_s = float(np.sqrt((PARTS - 1) * np.var(without)))
     return FoundTime(time_s, max(sigma_s, jackknife_s))
-
-
-def _views(log: RgbdLog, part: Trajectory) -> list[MovingView]:
-    """Frames with depth, pose and velocity that are not held out."""
-    motion, index_of = log.motion_along(part), {color: k for k, (color, _) in enumerate(log.pairing.pairs)}
-    found = []
-    for stamp, T in zip(part.stamps_ns.tolist(), part.poses, strict=True):
-        index = index_of[stamp]
-        if is_held_out(index) or log.pairing.pairs[index][1] is None:
-            continue
-        T_step = motion.between(stamp, stamp + STEP_NS)
-        if T_step is not None:
-            found.append(MovingView(index, stamp, T, se3.log(T_step) / (1e-9 * STEP_NS)))
-    return found
-
-
-def _changed(
-    first: MovingView, views: Sequence[MovingView], focal_px: float, reach_px: float, *, quantile: float
-) -> MovingView | None:
-    """The view next to one, in time and place, in which the camera moves most differently; None if there is none."""
-    near = [v for v in views if v is not first and abs(v.stamp_ns - first.stamp_ns) <= FARTHEST_NS]
-    if not near:
-        return None
-    px = focal_px * np.array([*[1 / TYPICAL_DEPTH_M] * 3, 1.0, 1.0, 1.0])
-    T = se3.inverse(first.T_map_camera) @ np.array([view.T_map_camera for view in near])
-    velocities = np.array([view.velocity for view in near])
-    changed = np.linalg.norm(px * change(T, first.velocity, velocities), axis=1)
-    reached = (changed > 0) & (np.linalg.norm(px * se3.log(T), axis=1) <= reach_px)
-    ranked = np.flatnonzero(reached)[np.argsort(-changed[reached], kind="stable")]
-    return near[int(ranked[round((1 - quantile) * (len(ranked) - 1))])] if len(ranked) else None
 
 
 def _solve(found: Sequence[MotionDifference], config: MotionTimeConfig) -> tuple[float, float]:

@@ -27,6 +27,7 @@ from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.motion_times import ReadoutConfig
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.frontend.frame_images import pyramid_of
+from duagc.pipeline.frontend.frame_pairs import FramePairs, MovingView
 from duagc.pipeline.frontend.motion_differences import (
     BY_COLOR,
     BY_DEPTH,
@@ -35,13 +36,11 @@ from duagc.pipeline.frontend.motion_differences import (
     STRIDES,
     FoundTime,
     MotionDifference,
-    MovingView,
     estimated_time,
-    has_sigma,
     joint_information,
-    view_pairs,
 )
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project, visible
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
@@ -75,36 +74,36 @@ class _Half:
     place_seen: float
 
 
-def certain_readout(log: RgbdLog, parts: Sequence[Trajectory], config: ReadoutConfig) -> Readout:
+def certain_readout(frames: FramePairs, config: ReadoutConfig) -> Readout:
     """How long color and depth are read, each if it is certain and long enough to matter; else 0.
 
     Nothing is looked for where the log states a readout, and only that of color where it has sigma of every depth: such
     depth is computed from images or sweeps, and its errors look alike in views that are near each other.
 
     Args:
-        log: its images as they were read.
-        parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
+        frames: pairs of frames of the log, its images as they were read.
         config: of the estimate.
     """
+    log, parts = frames.log, frames.parts
     if not config.enabled or log.states_readout:
         return Readout()
-    kinds = KINDS[:1] if has_sigma(log) else KINDS
+    kinds = KINDS[:1] if frames.has_sigma else KINDS
     longest_s = min(LONGEST_S, _interval_s(log))
     most = max(_moved(log, Readout(longest_s, longest_s, by_columns), parts) for by_columns in ORIENTATIONS)
     if most < config.least_move:
         return Readout()
     rounds = config.rounds if most >= config.move_to_track_again else 1
-    pairs = list(view_pairs(log, parts, config.pairs))
+    pairs = frames.spread(config.pairs)
 
     def left_of(readout: Readout) -> list[FoundTime | None]:
         with _made_still(log, readout, parts):
-            return _estimated(log, pairs, config, kinds, by_columns=readout.by_columns)
+            return _estimated(frames, pairs, config, kinds, by_columns=readout.by_columns)
 
     for by_columns in ORIENTATIONS:
         found = Readout(by_columns=by_columns)
         left = left_of(found)
         if left[0] is None:  # halves of images that are sheared too much cannot be registered
-            pairs = list(view_pairs(log, parts, config.pairs, TYPICAL))
+            pairs = frames.spread(config.pairs, TYPICAL)
             left = left_of(found)
         certain = _certain(left, config)
         if any(certain):
@@ -187,7 +186,7 @@ def _added(
 
 
 def _estimated(
-    log: RgbdLog,
+    frames: FramePairs,
     pairs: Sequence[tuple[MovingView, MovingView]],
     config: ReadoutConfig,
     kinds: Sequence[RegistrationConfig],
@@ -198,12 +197,13 @@ def _estimated(
 
     Depth is not looked at where it is none of the kinds.
     """
+    camera = frames.log.camera
     found: list[list[MotionDifference]] = [[], []]
     for first, second in pairs:
-        seen, other = log.frame(first.index), log.frame(second.index)
+        seen, other = frames.frame(first.index), frames.frame(second.index)
         T_start = first.pose_of(second)
-        target = RgbdPyramid(pyramid_of(other, log.camera, LEVELS).levels[1:])
-        halves = [_half(log, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
+        target = RgbdPyramid(pyramid_of(other, camera, LEVELS).levels[1:])
+        halves = [_half(camera, seen, T_start, half, by_columns=by_columns) for half in (0, 1)]
         for kind, of_kind in zip(kinds, found, strict=False):
             if (difference := _difference(first, second, halves, target, kind=kind)) is not None:
                 of_kind.append(difference)
@@ -211,10 +211,9 @@ def _estimated(
 
 
 def _half(
-    log: RgbdLog, frame: RgbdFrame, T_frame_other: Array, half: int, *, by_columns: bool
+    camera: PinholeCamera, frame: RgbdFrame, T_frame_other: Array, half: int, *, by_columns: bool
 ) -> _Half | None:
     """The first or the second half of a frame; None if the other frame sees hardly any of it."""
-    camera = log.camera
     lines = Readout(by_columns=by_columns).lines(camera)
     rest = slice(None, lines // 2) if half else slice(lines // 2, None)
     depth_m = frame.depth.copy()

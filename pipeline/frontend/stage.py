@@ -33,6 +33,7 @@ from duagc.pipeline.frontend.depth_quality import depth_noise_m, largest_depth_o
 from duagc.pipeline.frontend.exposure import ExposureEstimation
 from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector, Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages
+from duagc.pipeline.frontend.frame_pairs import FramePairs
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
 from duagc.pipeline.frontend.lost_frames import registered_again
 from duagc.pipeline.frontend.other_tracker import OtherTracker
@@ -207,12 +208,13 @@ class _Tracking:
         log, save = self.log, self.checkpoints
         keep = self.blocks.keep if self.config.exposure.mode != "off" else None
         first = save.done("tracked first", lambda: self._frames("tracking", keep))
-        if delay_ns := save.done("delay", lambda: self._delay_ns(first)):
+        pairs = FramePairs(log, trajectories_of(first)) if first.submaps[0].keyframes else None
+        if delay_ns := save.done("delay", lambda: self._delay_ns(pairs)):
             save.say(
                 f"depth of {log.robot} was taken {1e-6 * delay_ns:.1f} ms before its stamps, and is moved"
             )
             log.delay_depth(delay_ns)
-        if (readout := save.done("readout", lambda: self._readout(first))).rolls:
+        if (readout := save.done("readout", lambda: self._readout(pairs))).rolls:
             times = f"{1e3 * readout.color_s:.1f} and {1e3 * readout.depth_s:.1f} ms"
             save.say(f"rows of {log.robot} were read for {times} (color, depth), and are moved")
             log.readout = readout
@@ -226,15 +228,11 @@ class _Tracking:
             return tracked
         return track_leading_frames(self.log, tracked, self.config)
 
-    def _delay_ns(self, tracked: TrackedLog) -> int:
-        if not tracked.submaps[0].keyframes:
-            return 0
-        return certain_delay_ns(self.log, trajectories_of(tracked), self.config.delay)
+    def _delay_ns(self, pairs: FramePairs | None) -> int:
+        return 0 if pairs is None else certain_delay_ns(pairs, self.config.delay)
 
-    def _readout(self, tracked: TrackedLog) -> Readout:
-        if not tracked.submaps[0].keyframes:
-            return Readout()
-        return certain_readout(self.log, trajectories_of(tracked), self.config.readout)
+    def _readout(self, pairs: FramePairs | None) -> Readout:
+        return Readout() if pairs is None else certain_readout(pairs, self.config.readout)
 
     def _again(self, tracked: TrackedLog) -> TrackedLog:
         log = self.log

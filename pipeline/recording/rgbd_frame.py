@@ -35,6 +35,12 @@ class RgbdFrame:
     T_camera_moment: NDArray[np.float64] | None = None
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of the images."""
+        images = self.color, self.depth, self.mask, self.depth_sigma
+        return sum(image.nbytes for image in images if image is not None)
+
+    @property
     def usable_depth(self) -> NDArray[np.float32]:
         """The depth, 0 also where the mask forbids the pixel."""
         return masks.masked_depth(self.depth, self.mask)

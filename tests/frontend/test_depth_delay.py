@@ -9,6 +9,7 @@ import pytest
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.config.motion_times import DelayConfig
 from duagc.pipeline.frontend.depth_delay import certain_delay_ns
+from duagc.pipeline.frontend.frame_pairs import FramePairs
 from duagc.pipeline.frontend.motion_differences import MotionDifference, estimated_time
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
@@ -37,7 +38,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
 def found_ns(path: Path, config: DelayConfig = CONFIG) -> int:
     """The delay of a log by the true path."""
     with open_rgbd(path) as log:
-        return certain_delay_ns(log, [true_path(FRAMES)], config)
+        return certain_delay_ns(FramePairs(log, [true_path(FRAMES)]), config)
 
 
 def test_a_delay_is_found(logs: dict[int, Path]) -> None:
@@ -56,7 +57,7 @@ def test_what_the_stamps_say_is_no_delay(logs: dict[int, Path]) -> None:
     with open_rgbd(logs[LATE_NS]) as log:
         log.delay_depth(LATE_NS)
         assert log.frame(8).depth_offset_ns == FRAME_NS - LATE_NS  # the next depth is nearer now
-        assert certain_delay_ns(log, [true_path(FRAMES)], CONFIG) == 0
+        assert certain_delay_ns(FramePairs(log, [true_path(FRAMES)]), CONFIG) == 0
         log.delay_depth(0)
         assert log.frame(8).depth_offset_ns == 0
 

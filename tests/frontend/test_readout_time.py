@@ -11,7 +11,8 @@ from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.config.motion_times import ReadoutConfig
 from duagc.pipeline.frontend import readout_time
-from duagc.pipeline.frontend.motion_differences import FoundTime, MovingView
+from duagc.pipeline.frontend.frame_pairs import FramePairs, MovingView
+from duagc.pipeline.frontend.motion_differences import FoundTime
 from duagc.pipeline.frontend.readout_time import certain_readout
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -73,7 +74,7 @@ def images(readout: Readout, frames: int = FRAMES) -> list[tuple[np.ndarray, np.
 def found(path: Path, config: ReadoutConfig = CONFIG) -> Readout:
     """The readout of a log by the true path."""
     with open_rgbd(path) as log:
-        readout = certain_readout(log, [true_path(FRAMES)], config)
+        readout = certain_readout(FramePairs(log, [true_path(FRAMES)]), config)
         assert not log.readout.rolls
         return readout
 
@@ -123,7 +124,7 @@ def test_none_is_found_where_the_log_states_one_or_it_is_not_certain(
     stated = write(tmp_path / "stated", CAMERA, images(Readout(READOUT_S), frames=3), Readout().notes())
     with open_rgbd(stated) as log:
         assert log.states_readout
-        assert not certain_readout(log, [], CONFIG).rolls
+        assert not certain_readout(FramePairs(log, []), CONFIG).rolls
 
 
 def test_a_long_time_that_is_hardly_known_is_not_certain() -> None:
