@@ -158,7 +158,7 @@ class BlocksOfLog:
             width_px: about so many columns.
         """
         self._log, self._width_px = log, width_px
-        self._kept = dict[tuple[int, int | None], ColorBlocks]()
+        self._kept = dict[tuple[int, int], ColorBlocks]()
         self._kept_bytes = 0
 
     def keep(self, frame: RgbdFrame) -> None:
@@ -167,13 +167,12 @@ class BlocksOfLog:
         Args:
             frame: of the log, as it was read.
         """
-        times = self._log.pairing.pairs[frame.index]
         if (
             self._kept_bytes < MOST_KEPT_BYTES
-            and times[1] in (None, times[0])
+            and not self._log.frame_offset_ns(frame.index)
             and not is_held_out(frame.index)
         ):
-            self._kept[times] = blocks = self._of(frame)
+            self._kept[self._log.depth_delay_ns, frame.index] = blocks = self._of(frame)
             self._kept_bytes += blocks.nbytes
 
     def of(self, index: int) -> ColorBlocks:
@@ -195,7 +194,7 @@ class BlocksOfLog:
             self._taken(index)
 
     def _taken(self, index: int) -> ColorBlocks | None:
-        blocks = self._kept.pop(self._log.pairing.pairs[index], None)
+        blocks = self._kept.pop((self._log.depth_delay_ns, index), None)
         if blocks is not None:
             self._kept_bytes -= blocks.nbytes
         return blocks

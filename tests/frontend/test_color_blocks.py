@@ -52,6 +52,15 @@ def log(tmp_path: Path) -> Iterator[RgbdLog]:
         yield opened
 
 
+def test_blocks_of_other_depth_are_not_taken_for_those_of_a_frame(log: RgbdLog) -> None:
+    """Where depth is delayed by the time between images, each image has the depth of the next one."""
+    blocks = BlocksOfLog(log, WIDTH_PX)
+    blocks.keep(log.frame(3))
+    log.delay_depth(FRAME_NS)
+    assert log.frame_offset_ns(3) == 0
+    assert_equal(blocks.of(3), ColorBlocks.of(log.frame(3), log.camera, WIDTH_PX))
+
+
 def assert_equal(found: ColorBlocks, expected: ColorBlocks) -> None:
     assert found.camera == expected.camera
     np.testing.assert_array_equal(found.color, expected.color)
