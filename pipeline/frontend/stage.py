@@ -8,7 +8,7 @@ The stage is offline in this sense; times in the log are those of the recording 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import SupportsIndex
@@ -16,7 +16,6 @@ from typing import SupportsIndex
 import numpy as np
 
 from duagc.pipeline.base import determinism
-from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
@@ -27,16 +26,12 @@ from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.color_blocks import BlocksOfLog
-from duagc.pipeline.frontend.component_paths import ComponentPath, images_of, optimized_paths, trajectories_of
-from duagc.pipeline.frontend.depth_delay import certain_delay_ns
-from duagc.pipeline.frontend.depth_quality import depth_noise_m, largest_depth_offset_s, median_depth_m
+from duagc.pipeline.frontend.component_paths import ComponentPath, images_of, optimized_paths
+from duagc.pipeline.frontend.depth_quality import depth_noise_m, median_depth_m
 from duagc.pipeline.frontend.exposure import ExposureEstimation
 from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector, Reason
-from duagc.pipeline.frontend.frame_images import RgbdImages
-from duagc.pipeline.frontend.frame_pairs import FramePairs
-from duagc.pipeline.frontend.leading_frames import track_leading_frames
+from duagc.pipeline.frontend.log_tracking import LogTracking
 from duagc.pipeline.frontend.lost_frames import registered_again
-from duagc.pipeline.frontend.other_tracker import OtherTracker
 from duagc.pipeline.frontend.output import (
     BuiltMap,
     Maps,
@@ -47,19 +42,17 @@ from duagc.pipeline.frontend.output import (
     submap_messages,
     write_log,
 )
-from duagc.pipeline.frontend.readout_time import certain_readout, moves_rows_far
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.submap_joining import join_submaps
-from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
+from duagc.pipeline.frontend.submaps import TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe, tracked_path
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.view_poses import moved_factors
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.messages import Keyframe
-from duagc.pipeline.recording import MotionPrior, RgbdFrame, RgbdLog, open_rgbd
+from duagc.pipeline.recording import RgbdLog, open_rgbd
 from duagc.pipeline.recording.depth_motion import CurveKind
 from duagc.pipeline.recording.moved_depth import DELAY_KEY
-from duagc.pipeline.recording.rolling_shutter import Readout
 from duagc.pipeline.recording.shutter import FOUND_KEY
 from duagc.pipeline.registration.reference import sampled_grid
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -106,7 +99,9 @@ def run_frontend(
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
         blocks = BlocksOfLog(log, config.exposure.width_px)
-        tracking = _Tracking(log, config, motion, save, blocks, seed=seed, threads=threads, progress=progress)
+        tracking = LogTracking(
+            log, config, motion, save, blocks, seed=seed, threads=threads, progress=progress
+        )
         tracked = tracking.run()
         if not tracked.submaps[0].keyframes:
             raise NothingToMapError(log_path, _unmapped(log, tracked, config.tracking))
@@ -188,93 +183,6 @@ def _state_classes() -> tuple[type, ...]:
     from scipy.sparse import csc_array
 
     return (Config, Tracker, Relocalizer, FrameIntervals, FrozenImageDetector, OcclusionDetector, csc_array)
-
-
-@dataclass(frozen=True)
-class _Tracking:
-    """Tracks all frames of a log in order."""
-
-    log: RgbdLog
-    config: FrontendConfig
-    motion: MotionPrior | None
-    checkpoints: Checkpoints
-    blocks: BlocksOfLog
-    seed: int
-    threads: SupportsIndex
-    progress: bool
-
-    def run(self) -> TrackedLog:
-        """Track; where depth is of other times, or rows move far, again with them moved by the first result."""
-        log, save = self.log, self.checkpoints
-        keep = self.blocks.keep if self.config.exposure.mode != "off" else None
-        first = save.done("tracked first", lambda: self._frames("tracking", keep))
-        pairs = FramePairs(log, trajectories_of(first)) if first.submaps[0].keyframes else None
-        if delay_ns := save.done("delay", lambda: self._delay_ns(pairs)):
-            save.say(
-                f"depth of {log.robot} was taken {1e-6 * delay_ns:.1f} ms before its stamps, and is moved"
-            )
-            log.delay_depth(delay_ns)
-        if (readout := save.done("readout", lambda: self._readout(pairs))).rolls:
-            times = f"{1e3 * readout.color_s:.1f} and {1e3 * readout.depth_s:.1f} ms"
-            save.say(f"rows of {log.robot} were read for {times} (color, depth), and are moved")
-            log.readout = readout
-        tracked = save.done("tracked", lambda: self._leading(self._again(first)))
-        if tracked.submaps[0].keyframes:
-            log.move_depth(*trajectories_of(tracked))
-        return tracked
-
-    def _leading(self, tracked: TrackedLog) -> TrackedLog:
-        if not tracked.submaps[0].keyframes or self.config.tracking.method != "registration":
-            return tracked
-        return track_leading_frames(self.log, tracked, self.config)
-
-    def _delay_ns(self, pairs: FramePairs | None) -> int:
-        return 0 if pairs is None else certain_delay_ns(pairs, self.config.delay)
-
-    def _readout(self, pairs: FramePairs | None) -> Readout:
-        return Readout() if pairs is None else certain_readout(pairs, self.config.readout)
-
-    def _again(self, tracked: TrackedLog) -> TrackedLog:
-        log = self.log
-        if not (log.needs_motion and tracked.submaps[0].keyframes):
-            return tracked
-        log.move_depth(*trajectories_of(tracked))
-        late = bool(log.pairing.largest_offset_ns)
-        return self._frames("tracking again") if late or moves_rows_far(log, self.config.readout) else tracked
-
-    def _frames(self, part: str, keep: Callable[[RgbdFrame], None] | None = None) -> TrackedLog:
-        log, save = self.log, self.checkpoints
-        tracker = self._tracker()
-        begin = 0
-        if (saved := save.resume(part)) is not None:
-            begin, state = saved
-            tracker.go_on(state)
-        left: Iterable[int] = range(begin, len(log))
-        if self.progress:
-            left = progress_bar.track(left, f"{part} {log.robot}", len(log) - begin)
-        for index in left:
-            frame = log.frame(index)
-            if keep is not None:
-                keep(frame)
-            tracker.track(RgbdImages.of(frame))
-            save.at(part, index + 1, len(log), tracker.state, shown=tracker.path)
-        return tracker.finish()
-
-    def _tracker(self) -> SubmapTracker | OtherTracker:
-        """As the configuration asks for; others than the usual one are imported by need."""
-        camera, config = self.log.camera, self.config
-        limit_s = largest_depth_offset_s(self.log.pairing.pairs, config.keyframes.max_depth_offset_s)
-        if config.tracking.method == "registration":
-            return SubmapTracker(camera, config, self.motion, max_depth_offset_s=limit_s)
-        keyframes = config.keyframes.model_copy(update={"max_depth_offset_s": limit_s})
-        config = config.model_copy(update={"keyframes": keyframes})
-        if config.tracking.method == "rendering":
-            from duagc.pipeline.frontend.rendering_tracker import RenderingTracker
-
-            return RenderingTracker(camera, config, self.log.frame, seed=self.seed, threads=self.threads)
-        from duagc.pipeline.frontend.open3d_tracker import Open3dTracker
-
-        return Open3dTracker(camera, config, self.log.frame)
 
 
 @dataclass(frozen=True, kw_only=True)

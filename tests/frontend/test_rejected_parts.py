@@ -70,7 +70,7 @@ def test_a_part_that_depth_contradicts_goes_on_as_a_component(
     walk, tracked: TrackedLog, at: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shots, truth = walk
-    monkeypatch.setattr(stage._Tracking, "run", lambda _: broken(tracked, at))
+    monkeypatch.setattr(stage.LogTracking, "run", lambda _: broken(tracked, at))
     path = tmp_path / "frontend.mcap"
     run_frontend(write(tmp_path / "recording", shots[:FRAMES]), path, CONFIG)
     names = {"alpha": path, "alpha-2": component_path(path, "alpha-2")}
