@@ -42,6 +42,7 @@ from duagc.pipeline.frontend.output import (
     submap_messages,
     write_log,
 )
+from duagc.pipeline.frontend.pose_optimization import OptimizedPath
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import TrackedLog
@@ -222,51 +223,80 @@ class _ComponentStage:
             path: of the component.
             out_path: of its log.
         """
-        log, clock, save, optimized = self.log, self.clock, self.checkpoints, path.optimized
-        solution, frames = optimized.solution, optimized.frames
-        log.move_depth(tracked_path(frames, solution.T_map_keyframe))
-        if log.needs_motion:
-            frames = save.done(
-                f"{self.name}.poses.found",
-                lambda: registered_again(
-                    optimized.frames,
-                    path.tracked_frames,
-                    optimized.keyframes,
-                    images_of(log),
-                    config=self.config,
-                ),
-            )
+        log, solution = self.log, path.optimized.solution
+        frames = self._placed(path)
         tracked = tracked_path(frames, solution.T_map_keyframe)
         log.move_depth(tracked, kind=(kind := CurveKind.of(tracked, log.gyro)))
-        keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
+        exposures = self._exposures(path.optimized, frames)
+        self.clock.lap("refinement_s")
+        keyframes = keyframe_messages(self.name, path.optimized.keyframes, solution)
+        built = self._map(keyframes, frames, exposures)
+        self._write(built, path, exposures, out_path, notes=self._notes(built.shutter_s, kind))
+        self.clock.lap("writing_s")
+
+    def _placed(self, path: ComponentPath) -> list[TrackedFrame]:
+        """Frames at the optimized poses; registered again where depth and rows are moved by these."""
+        optimized = path.optimized
+        self.log.move_depth(tracked_path(optimized.frames, optimized.solution.T_map_keyframe))
+        if not self.log.needs_motion:
+            return optimized.frames
+        return self.checkpoints.done(
+            f"{self.name}.poses.found",
+            lambda: registered_again(
+                optimized.frames,
+                path.tracked_frames,
+                optimized.keyframes,
+                images_of(self.log),
+                config=self.config,
+            ),
+        )
+
+    def _exposures(self, optimized: OptimizedPath, frames: Sequence[TrackedFrame]) -> ExposureTrack:
+        """Exposures of all frames."""
         part = f"{self.name}.exposures"
-        estimation = ExposureEstimation(self.blocks.of, self.config.exposure, save, part)
-        exposures = save.done(
+        estimation = ExposureEstimation(self.blocks.of, self.config.exposure, self.checkpoints, part)
+        exposures = self.checkpoints.done(
             part,
             lambda: estimation.run(
-                [keyframe.frame_index for keyframe in keyframes],
-                solution.T_map_keyframe,
+                [keyframe.frame_index for keyframe in optimized.keyframes],
+                optimized.solution.T_map_keyframe,
                 [(factor.i, factor.j) for factor in optimized.factors],
                 frames,
             ),
         )
         self.blocks.forget(frame.frame_index for frame in frames)
-        clock.lap("refinement_s")
-        built = self._map(keyframes, frames, exposures)
-        refined = replace(solution, T_map_keyframe=built.T_map_keyframe)
-        moved = moved_factors(optimized.factors, solution, built.T_map_keyframe)
+        return exposures
+
+    def _notes(self, shutter_s: float, kind: CurveKind) -> dict[str, str]:
+        """What the metadata of the log say of its images."""
+        log = self.log
         notes = {
             "color_without_depth": str(len(log.pairing.color_alone)),
             "depth_without_color": str(len(log.pairing.depth_alone)),
             "depth_noise_m": "unknown" if self.noise_m is None else f"{self.noise_m:.6f}",
         }
-        notes |= {DELAY_KEY: str(log.depth_delay_ns)} if log.depth_delay_ns else {}
+        if log.depth_delay_ns:
+            notes[DELAY_KEY] = str(log.depth_delay_ns)
         if log.readout.rolls and not log.states_readout:
             notes |= log.readout.notes()
-        if built.shutter_s > 0:
-            notes[FOUND_KEY] = repr(built.shutter_s)
-        if log.needs_motion or built.shutter_s > 0:
+        if shutter_s > 0:
+            notes[FOUND_KEY] = repr(shutter_s)
+        if log.needs_motion or shutter_s > 0:
             notes |= kind.notes()
+        return notes
+
+    def _write(
+        self,
+        built: BuiltMap,
+        path: ComponentPath,
+        exposures: ExposureTrack,
+        out_path: Path,
+        *,
+        notes: dict[str, str],
+    ) -> None:
+        optimized = path.optimized
+        refined = replace(optimized.solution, T_map_keyframe=built.T_map_keyframe)
+        moved = moved_factors(optimized.factors, optimized.solution, built.T_map_keyframe)
         odometry = [odometry_message(self.name, frame, refined.T_map_keyframe) for frame in built.frames]
         write_log(
             out_path,
@@ -280,7 +310,6 @@ class _ComponentStage:
             maps=built.maps,
             notes=notes,
         )
-        clock.lap("writing_s")
 
     def _map(
         self, keyframes: Sequence[Keyframe], frames: list[TrackedFrame], exposures: ExposureTrack
