@@ -14,7 +14,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, read_json, read_toml
 from duagc.pipeline.comparison.fields import Unequal, unequal
 from duagc.pipeline.comparison.recordings import description_of, files_of, made_otherwise, points_of
-from duagc.pipeline.comparison.summary import ORDER, stage_of
+from duagc.pipeline.comparison.summary import ORDER, libraries_of, stage_of
 from duagc.pipeline.comparison.tolerances import Tolerances
 from duagc.pipeline.recording import RECORDING_FILE, Record, log_metadata, read_log
 from duagc.pipeline.runs.digest import digest_file, result_files
@@ -114,7 +114,7 @@ def compare(first: Path, second: Path, tolerances: Tolerances = NOTHING) -> Comp
     files = [_files(path, kinds[0]) for path in (first, second)]
     names = sorted({*files[0], *files[1]}, key=lambda name: (ORDER.index(stage_of(name)), name))
     if kinds[0] == "a run":
-        out.notes += _settings(first, second)
+        out.notes += _settings(first, second) + _libraries(first, second)
     else:
         out.notes += made_otherwise(first, second)
     for name in names:
@@ -154,6 +154,12 @@ def _settings(first: Path, second: Path) -> list[str]:
             return []
         tables.append(read_toml(path, "the configuration of a run"))
     return [f"setting {found.text()}" for found in unequal(tables[0], tables[1])]
+
+
+def _libraries(first: Path, second: Path) -> list[str]:
+    """Versions of libraries that differ: LAPACK of another numpy rounds otherwise."""
+    tables = [libraries_of(run) for run in (first, second)]
+    return [f"library {found.text()}" for found in unequal(tables[0], tables[1])] if all(tables) else []
 
 
 def _compare_files(

@@ -38,6 +38,7 @@ def store(golden: Path, run: Path) -> None:
         raise DuagError(f"{run}: has no results of robots, expected a finished run")
     content = {
         "digest": found.digest,
+        "libraries": found.libraries,
         "files": found.files,
         "topics": {
             file: {
@@ -78,17 +79,20 @@ def _read(golden: Path) -> tuple[RunSummary, dict[str, object]]:
                 for topic, stored in of_file.items()
             }
         metrics, metadata = content["metrics"], content.get("metadata", {})
-        tables = [content["files"], metrics, metadata, *metadata.values()]
+        libraries = content.get("libraries", {})
+        tables = [content["files"], metrics, libraries, metadata, *metadata.values()]
         tables += [topic.fields for topic in topics.values()]
         if not all(isinstance(table, dict) for table in tables):
             raise TypeError("found a list or a value in place of a table")
-        return RunSummary(content["digest"], content["files"], topics, metadata), metrics
+        return RunSummary(content["digest"], content["files"], topics, metadata, libraries), metrics
     except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise DuagError(f"{golden}: {error}, expected a golden run (.json and .npz)") from error
 
 
 def differences(golden: Path, run: Path) -> list[str]:
     """One line for every topic, metadata, file and metric that differs from what is stored; earlier stages first.
+
+    Where any does, other versions of libraries come before them, which may be why.
 
     Args:
         golden: file of the golden run.
@@ -124,7 +128,10 @@ def differences(golden: Path, run: Path) -> list[str]:
         lines += (of_topics + of_metadata) or [
             f"{where}: digest {found.files.get(file, 'absent')}, stored {stored.files.get(file, 'absent')}"
         ]
-    return lines + _metric_differences(metrics, metrics_of(run))
+    lines += _metric_differences(metrics, metrics_of(run))
+    if not (lines and stored.libraries and found.libraries):
+        return lines
+    return [f"library {line}" for line in _table_differences(stored.libraries, found.libraries)] + lines
 
 
 def _topic_difference(topic: str, stored: Any, found: Any) -> str | None:

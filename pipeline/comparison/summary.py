@@ -54,12 +54,14 @@ class RunSummary:
         files: digest of every result file.
         topics: of every log, by (file, topic).
         metadata: of every log, by file; what is JSON is opened into dotted names.
+        libraries: versions of those that it was computed with, by name; empty: it does not say.
     """
 
     digest: str
     files: dict[str, str]
     topics: dict[tuple[str, str], TopicSummary]
     metadata: dict[str, dict[str, Any]]
+    libraries: dict[str, str]
 
 
 def stage_of(file: str) -> str:
@@ -130,7 +132,18 @@ def summarize(run: Path) -> RunSummary:
         for topic, found in summarize_log(run / file).items()
     }
     metadata = {file: flat(log_metadata(run / file)) for file in files if file.endswith(".mcap")}
-    return RunSummary(digest(run), files, topics, metadata)
+    return RunSummary(digest(run), files, topics, metadata, libraries_of(run))
+
+
+def libraries_of(run: Path) -> dict[str, str]:
+    """Versions of the libraries that a run was computed with, by name; empty if it does not say.
+
+    Args:
+        run: its folder.
+    """
+    path = run / "manifest.json"
+    stated = read_json(path, "the manifest of a run").get("libraries") if path.is_file() else None
+    return {str(name): str(version) for name, version in stated.items()} if isinstance(stated, dict) else {}
 
 
 def flat(metadata: Mapping[str, Any]) -> dict[str, Any]:

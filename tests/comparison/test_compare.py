@@ -114,6 +114,18 @@ def test_changed_settings_are_noted_and_are_no_difference(fake: fake_run.FakeRun
     assert found.notes == ["setting exchange.consensus.tolerance: 1e-05 and 0.0001"]
 
 
+def test_other_versions_of_libraries_are_noted_and_are_no_difference(
+    fake: fake_run.FakeRun, other: Path, tmp_path: Path
+) -> None:
+    first = tmp_path / "first"
+    shutil.copytree(fake.run, first)
+    for run, version in ((first, "2.4.6"), (other, "2.5.5")):
+        (run / "manifest.json").write_text(json.dumps({"libraries": {"numpy": version, "scipy": "1.17.1"}}))
+    found = compare(first, other)
+    assert found.equal
+    assert found.notes == ["library numpy: 2.4.6 and 2.5.5"]
+
+
 def test_tolerances_count_per_field_and_have_reasons(
     fake: fake_run.FakeRun, other: Path, tmp_path: Path
 ) -> None:

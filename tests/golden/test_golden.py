@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
@@ -89,6 +90,20 @@ def test_a_changed_setting_is_named(run: Path, tmp_path: Path) -> None:
             log.write(record.topic, record.proto(), record.log_time_ns, record.publish_time_ns)
     (line,) = differences(golden, tmp_path / "run")
     assert line == "exchange: exchange.mcap: metadata config.link.loss_probability: 0.75, stored 0.3"
+
+
+def test_other_versions_of_libraries_are_named_where_something_differs(run: Path, tmp_path: Path) -> None:
+    golden, arrays = tmp_path / "golden.json", golden_of(QUICK).with_suffix(".npz")
+    shutil.copy(arrays, tmp_path / "golden.npz")
+    content = json.loads(golden_of(QUICK).read_text())
+    content["libraries"]["numpy"] = "2.5.5"
+    golden.write_text(json.dumps(content))
+    assert differences(golden, run) == []
+    content["files"].pop("robots/alpha/odometry.tum")
+    golden.write_text(json.dumps(content))
+    first, second = differences(golden, run)
+    assert first == f"library numpy: '{np.__version__}', stored '2.5.5'"
+    assert "robots/alpha/odometry.tum" in second
 
 
 def test_a_changed_metric_is_named(run: Path, tmp_path: Path) -> None:
