@@ -9,7 +9,7 @@ TEST_WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
-SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/* converters/simulate/render/src/*) $(wildcard pipeline/base/stand_ins/*.[ht]*)
+SOURCES := pyproject.toml constraints.txt CMakeLists.txt $(wildcard pipeline/kernels/src/* converters/simulate/render/src/*) $(wildcard pipeline/base/stand_ins/*.[ht]*)
 SANITIZED := build/sanitize/.built
 DEMO := outputs/demo
 DOCS_VENV := build/docs-venv
@@ -42,7 +42,7 @@ $(STAMP): $(SOURCES)
 	@$(PYTHON) -c 'import os, sys, sysconfig; sys.exit(not os.path.exists(os.path.join(sysconfig.get_paths()["include"], "Python.h")))' || { echo "setup: Python.h not found; on Debian: apt-get install python3-dev" >&2; exit 1; }
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH_OPTIONS) "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test,lint,dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,lint,dev]"
 	@# with PYTHONDONTWRITEBYTECODE, every process of a run would compile its modules again
 	$(BIN)/python -m compileall -q pipeline converters schemas
 	touch $(STAMP)

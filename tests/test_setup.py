@@ -1,10 +1,23 @@
-"""`make setup` after one that was stopped: an environment without pip is made anew."""
+"""`make setup`: an environment without pip is made anew; libraries have the versions of the golden runs."""
 
+import json
 import shutil
 import subprocess
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
+import pytest
+from packaging.requirements import Requirement
+
+from duagc.pipeline.manifest import LIBRARIES
+
 ROOT = Path(__file__).parents[1]
+PINNED = [
+    Requirement(line)
+    for line in (ROOT / "constraints.txt").read_text().splitlines()
+    if line and not line.startswith("#")
+]
 PYTHON = """#!/bin/sh
 echo "$(basename "$0") $*" >> "{log}"
 if [ "$2" = venv ]; then
@@ -14,7 +27,7 @@ fi
 
 
 def test_an_environment_without_pip_is_made_anew(tmp_path: Path) -> None:
-    for name in ("Makefile", "pyproject.toml", "CMakeLists.txt"):
+    for name in ("Makefile", "pyproject.toml", "constraints.txt", "CMakeLists.txt"):
         shutil.copy(ROOT / name, tmp_path / name)
     log, half = tmp_path / "log", tmp_path / ".venv" / "bin" / "python"
     made, python = "python3 -m venv --clear .venv", tmp_path / "python3"
@@ -34,3 +47,23 @@ def test_an_environment_without_pip_is_made_anew(tmp_path: Path) -> None:
     )
     assert done.returncode
     assert "Python 3.9 found, Python 3.11 or later expected" in done.stderr
+
+
+@pytest.mark.parametrize("pinned", PINNED, ids=lambda pinned: pinned.name)
+def test_pinned_versions_are_allowed_and_installed(pinned: Requirement) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    allowed = next(r for r in map(Requirement, project["dependencies"]) if r.name == pinned.name)
+    found = metadata.version(pinned.name)
+    assert found in pinned.specifier
+    assert found in allowed.specifier
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "tests" / "golden").glob("*.json")), ids=lambda path: path.stem
+)
+def test_golden_runs_were_made_with_the_pinned_versions(path: Path) -> None:
+    libraries = json.loads(path.read_text())["libraries"]
+    assert set(libraries) == set(LIBRARIES)
+    pinned = [requirement for requirement in PINNED if requirement.name in libraries]
+    assert len(pinned) == 3
+    assert all(libraries[requirement.name] in requirement.specifier for requirement in pinned)

@@ -29,6 +29,7 @@ FILES = {
     "Makefile",
     "README.md",
     "codespell.txt",
+    "constraints.txt",
     "mkdocs.yml",
     "pyproject.toml",
 }
