@@ -301,7 +301,7 @@ def info_parts(image_topic: str) -> list[tuple[str, ...]]:
     """
     path = image_path(image_topic)
     names = re.sub(r"image(_.*)?$", INFO_NAME, path.name), INFO_NAME
-    return [_parts(str(path.with_name(name))) for name in names]
+    return [_parts(str(path.parent / name)) for name in names]
 
 
 def shared_parts(a: str, b: str) -> int:

@@ -9,7 +9,7 @@ import pytest
 from duagc.converters import registry
 from duagc.converters.logs import open_log
 from duagc.converters.logs.cameras import is_rectified
-from duagc.converters.logs.choice import Chooser
+from duagc.converters.logs.choice import Chooser, info_parts
 from duagc.converters.logs.files import is_below
 from duagc.pipeline.recording import info
 from tests.fixtures.ros_bags import SMALL, START_NS, Ros, still
@@ -75,3 +75,8 @@ def test_camera_info_lies_next_to_its_images(
             chooser.info(f"{name}_info", topic).topic for name, topic in (("color", color), ("depth", depth))
         ]
     assert found == list(infos)
+
+
+@pytest.mark.parametrize("name", ["", "/", ".", "//"])
+def test_images_on_a_topic_without_a_name_are_looked_at_too(name: str) -> None:
+    assert info_parts(name)[-1] == ("camera_info",)
