@@ -32,7 +32,7 @@ from duagc.converters.layouts.derived_depth import (
 )
 from duagc.converters.layouts.image_files import options_of
 from duagc.converters.layouts.ros_images import UnusableImage
-from duagc.converters.layouts.ros_points import VELODYNE
+from duagc.converters.layouts.ros_points import VELODYNE, UnusableSweep
 from duagc.converters.layouts.s3e_layout import Fixes, S3eCalibration, read_fixes
 from duagc.converters.layouts.stereo import StereoOptions, StereoRig
 from duagc.converters.logs import open_log
@@ -243,14 +243,19 @@ class _Vehicle:
         if self.settings.depth == "lidar":
             robot.set_lidar(self.lidar.T_camera_lidar, self.lidar.range_sigma_m)
         feed, scale, empty = ImuFeed(robot, self.readings), ScaleCheck(self.lidar, self.rig), 0
-        broken: list[UnusableImage] = []
+        broken, swept = list[UnusableImage](), list[UnusableSweep]()  # images and sweeps that are none
         found = gathered(self.log, self.groups, lambda entry: entry.header_ns())
         for parts in track(found, f"convert {robot.name}", len(self.groups)):
             stamp = parts[self.left].header_ns()
             feed.until(stamp)
-            points = self._sweep(parts, stamp)
+            points = np.zeros((0, 3))
             try:
                 image, depth, sigma_m = self._images(parts)
+                points = self._sweep(parts, stamp)
+            except UnusableSweep as error:
+                swept.append(error)
+                if self.settings.depth == "lidar":
+                    continue
             except UnusableImage as error:
                 broken.append(error)
                 continue
@@ -263,10 +268,14 @@ class _Vehicle:
                 empty += int((depth == 0).sum())
                 if len(points):
                     scale.add(points, depth)
-        if len(broken) == len(self.groups):
-            raise broken[0]
+        left_out = [*broken, *swept] if self.settings.depth == "lidar" else broken
+        if len(left_out) == len(self.groups):
+            raise left_out[0]
         if broken:
             self.warnings.append(f"{len(broken)} frames have images that are cut short or broken; left out")
+        if swept:
+            lost = "frames" if self.settings.depth == "lidar" else "frames that test the scale of stereo"
+            self.warnings.append(f"{len(swept)} {lost} have a sweep that is cut short; left out")
         if self.settings.depth == "lidar":
             return rows
         pixels = (len(self.groups) - len(broken)) * self.rig.camera.width * self.rig.camera.height

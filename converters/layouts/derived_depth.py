@@ -54,7 +54,8 @@ class LidarSource:
             where: begins the line of an error.
 
         Raises:
-            DuagError: the message holds no points that can be read.
+            UnusableSweep: the message is cut short.
+            DuagError: it holds no points that can be read.
         """
         points, seconds = points_of(message, where, self.times)
         times_ns = stamp_ns + np.rint(seconds * 1e9).astype(np.int64)

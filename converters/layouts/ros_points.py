@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.converters.layouts.ros_images import UnusableImage
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
@@ -31,6 +32,10 @@ MOMENT_NS = 2_000_000  # points no further apart in time are moved together
 LEAST_PERIOD_S, USUAL_PERIOD_S, MOST_PERIOD_S = 1e-3, 0.1, 0.2  # between sweeps, unless some were left out
 LEAST_SHARE, MOST_SHARE = 0.02, 20.0  # of the period, that a sweep takes: one unit is between them
 LEAST_SOUND = 0.6  # of the points of a sweep, whose times are near its stamp
+
+
+class UnusableSweep(UnusableImage):
+    """A sweep of a log is cut short; others of its topic may be sound."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +62,19 @@ class PointTimes:
         from its stamp.
 
         Args:
-            messages: some sweeps in order of recording, at least one.
+            messages: some sweeps in order of recording, at least one; those that are cut short do not count.
             where: begins the line of an error.
+        Raises:
+            UnusableSweep: all are cut short.
         """
-        rows = [_Rows(message, where) for message in messages]
+        rows, broken = list[_Rows](), list[UnusableSweep]()
+        for message in messages:
+            try:
+                rows.append(_Rows(message, where))
+            except UnusableSweep as error:
+                broken.append(error)
+        if broken and not rows:
+            raise broken[0]
         period_s = _period_s(messages)
         names = [name for name in _TIMES if all(name in row.fields for row in rows)]
         known = [
@@ -158,7 +172,8 @@ class _Rows:
         data = np.frombuffer(bytes(message.data), np.uint8)
         missing = [name for name in "xyz" if name not in self.fields]
         if missing or step < 1 or row < step * width or len(data) < row * height:
-            raise DuagError(
+            kind = UnusableSweep if not missing and step > 0 and row >= step * width else DuagError
+            raise kind(
                 f"{where} has fields {sorted(self.fields)} and {len(data)} bytes for {width}x{height} points "
                 f"of {step}, expected x, y, z and {max(row, step * width) * height} bytes"
             )

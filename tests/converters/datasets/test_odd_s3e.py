@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from duagc.pipeline.recording import Recording, open_rgbd
 from tests.fixtures.s3e import FRAMES, START_NS, STEP_NS, change_messages, write_bag, write_calibration
 
 LEFT, RIGHT, IMU = "/Alpha/left_camera/compressed", "/Alpha/right_camera/compressed", "/Alpha/imu/data"
+POINTS = "/Alpha/velodyne_points"
 Change = Callable[[int, Any], None]
 
 
@@ -63,6 +64,27 @@ def test_a_broken_image_costs_its_frame_alone(sequence: Path, topic: str, depth:
     assert any(
         "1 frames have images that are cut short" in text for text in recording.description["warnings"]
     )
+
+
+@pytest.mark.parametrize(
+    ("depth", "kept", "words"),
+    [("stereo", range(FRAMES), "that test the scale of stereo "), ("lidar", [0, 2], "")],
+)
+def test_a_sweep_that_is_cut_short_costs_no_more_than_it_gives(
+    sequence: Path, depth: str, kept: Sequence[int], words: str
+) -> None:
+    change_messages(sequence, POINTS, "PointCloud2", cut(range(1, 2)))
+    recording = converted(sequence, f"depth={depth}")
+    with open_rgbd(recording.log("alpha")) as log:
+        assert [frame.stamp_ns for frame in log.frames()] == [START_NS + k * STEP_NS for k in kept]
+    warning = f"alpha (Alpha): 1 frames {words}have a sweep that is cut short; left out"
+    assert warning in recording.description["warnings"]
+
+
+def test_sweeps_that_are_all_cut_short_are_refused(sequence: Path) -> None:
+    change_messages(sequence, POINTS, "PointCloud2", cut(range(FRAMES)))
+    with pytest.raises(DuagError, match=r"velodyne_points has fields .* and 50 bytes for"):
+        converted(sequence, "depth=lidar")
 
 
 def test_broken_images_alone_are_refused(sequence: Path) -> None:

@@ -34,6 +34,7 @@ from tests.fixtures.s3e import (
     START_NS,
     STEP_NS,
     T_right_left_of,
+    change_messages,
     pose_at,
 )
 from tests.fixtures.stereo_room import render, right_of
@@ -282,6 +283,21 @@ def test_points_in_microseconds_are_taken_so_and_it_is_told(tmp_path: Path) -> N
         with open_rgbd(recording.log("alpha")) as found:
             depths.append(found.frame(1).depth)
     np.testing.assert_allclose(depths[1], depths[0], atol=1e-3)
+
+
+def test_a_sweep_that_is_cut_short_costs_its_frame_alone(tmp_path: Path) -> None:
+    def cut(number: int, message: Any) -> None:
+        message.data = message.data[: 50 if number == 0 else None]
+
+    log = lidar_log(tmp_path)
+    change_messages(log, "/points", "PointCloud2", cut)
+    registry.convert("ros", log, tmp_path / "rec", options=["depth_from=lidar", "imu=/imu"])
+    recording = Recording(tmp_path / "rec")
+    with open_rgbd(recording.log("alpha")) as found:
+        assert [frame.stamp_ns for frame in found.frames()] == [START_NS + k * STEP_NS for k in (1, 2)]
+    assert any(
+        "1 frames have color or depth that is cut short" in w for w in recording.description["warnings"]
+    )
 
 
 def test_logs_without_depth_say_what_could_be_used(tmp_path: Path) -> None:
