@@ -8,6 +8,7 @@ camera to world with OpenGL axes. Photographs are not a video: consecutive ones 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from duagc.pipeline.base.files import read_json
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 0.001
+LENS = "k1", "k2", "k3", "k4", "p1", "p2"  # coefficients of a lens in the notation of nerfstudio
+STRAIGHT = "PINHOLE", "SIMPLE_PINHOLE", "OPENCV"  # camera models that are pinholes where these are 0
 OPENCV_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -74,11 +77,15 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         raise DuagError(
             f"{path}: {type(error).__name__} {error}, expected w, h, fl_x, fl_y, cx, cy and frames"
         ) from error
+    _check_undistorted(content, path)
     check_camera(camera, str(path))
     names = Counter(Path(name).name for name, _, _ in entries)  # that of their files here
     for name, count in names.items():
         if count > 1:
             raise DuagError(f"{path}: found {name} {count} times, expected every image once")
+    for name, _, is_bad in entries:
+        if not isinstance(is_bad, bool):
+            raise DuagError(f"{path}: is_bad of {name} is {is_bad!r}, expected true or false")
     taken = [e for e in entries if settings.bad or not e[2]]
     if not taken:
         raise DuagError(f"{path}: names no usable image, expected frames")
@@ -102,6 +109,18 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     image_folder.write_parts(
         out, "scannetpp", src, clip, robots=robots, options=settings, warnings=warnings, force=force
     )
+
+
+def _check_undistorted(content: Mapping[str, Any], path: Path) -> None:
+    """Refuse the camera of images as they were taken."""
+    model = content.get("camera_model", STRAIGHT[0])
+    if model not in STRAIGHT:
+        raise DuagError(
+            f"{path}: camera_model is {model!r}, expected {STRAIGHT[0]!r}, as of undistorted images"
+        )
+    for name in LENS:
+        if (value := content.get(name, 0)) != 0:
+            raise DuagError(f"{path}: {name} is {value!r}, expected 0, as of undistorted images")
 
 
 def _made(path: Path) -> Path:

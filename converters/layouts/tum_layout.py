@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -185,7 +186,7 @@ class Poses:
 
     @staticmethod
     def read(path: Path) -> Poses:
-        """From lines `timestamp tx ty tz qx qy qz qw`, also with commas; those with nan are only counted.
+        """From lines `timestamp tx ty tz qx qy qz qw`, also with commas; those that hold no pose are only counted.
 
         Args:
             path: of the file; times in seconds, positions in meters. Of one time the last pose counts.
@@ -208,7 +209,7 @@ class Poses:
                 raise DuagError(
                     f"{where}: {line.strip()[:60]!r}, expected eight numbers: time (s) x y z qx qy qz qw"
                 )
-            if np.all(np.isfinite(values)) and np.linalg.norm(values[3:]) > 0.5:
+            if np.all(np.isfinite(values)) and 0.5 < math.hypot(*values[3:]) < 2.0:
                 check_near(values[:3], where)
                 rows[nanoseconds(words[0], where)] = values
             else:

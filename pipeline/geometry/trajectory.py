@@ -13,7 +13,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file, read_text
 from duagc.pipeline.geometry import se3, so3
 
-LEAST_QUATERNION = 1e-3  # length of what still has a direction
+LENGTHS = 1e-3, 1e3  # of a quaternion: below it has no direction, above it is none
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def read_tum(path: str | Path) -> Trajectory:
     Returns:
         T_reference_body over time, meters.
     Raises:
-        DuagError: the file cannot be read, a line is not eight finite numbers, or a quaternion is zero.
+        DuagError: the file cannot be read, a line is not eight finite numbers, or a quaternion is zero or huge.
     """
     stamps, rows = [], []
     text = read_text(Path(path), "a TUM trajectory")
@@ -79,7 +79,7 @@ def read_tum(path: str | Path) -> Trajectory:
             row = []
         if len(row) != 7 or not np.all(np.isfinite(row)):
             raise DuagError(f"{path}: line {number} is {line.strip()[:60]!r}, expected eight finite numbers")
-        if math.hypot(*row[3:]) < LEAST_QUATERNION:
+        if not LENGTHS[0] <= math.hypot(*row[3:]) <= LENGTHS[1]:
             found = " ".join(fields[4:])
             raise DuagError(f"{path}: line {number} has the quaternion {found}, expected one of length 1")
         stamps.append(stamp)

@@ -51,10 +51,11 @@ def test_bad_tum_lines_are_named(tmp_path: Path, line: str) -> None:
         trajectory.read_tum(path)
 
 
-def test_a_quaternion_of_zero_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("quaternion", ["0 0 0 0", "1e200 0 0 1e200"])
+def test_a_quaternion_that_is_none_is_named(tmp_path: Path, quaternion: str) -> None:
     path = tmp_path / "bad.tum"
-    path.write_text("1.0 1 2 3 0 0 0 1\n2.0 1 2 3 0 0 0 0\n")
-    with pytest.raises(DuagError, match="line 2 has the quaternion 0 0 0 0"):
+    path.write_text(f"1.0 1 2 3 0 0 0 1\n2.0 1 2 3 {quaternion}\n")
+    with pytest.raises(DuagError, match=f"line 2 has the quaternion {quaternion}"):
         trajectory.read_tum(path)
 
 

@@ -75,6 +75,26 @@ def photographed_twice(p: Path) -> None:
     file.write_text(json.dumps(content))
 
 
+def stated(**values: object) -> Spoil:
+    """Of the camera."""
+
+    def state(p: Path) -> None:
+        (file,) = p.rglob("*.json")
+        file.write_text(json.dumps(json.loads(file.read_text()) | values))
+
+    return state
+
+
+def said_bad(word: object) -> Spoil:
+    def say(p: Path) -> None:
+        (file,) = p.rglob("*.json")
+        content = json.loads(file.read_text())
+        content["frames"][0]["is_bad"] = word
+        file.write_text(json.dumps(content))
+
+    return say
+
+
 def nested(p: Path) -> None:
     next(p.rglob("*.json")).write_text("[" * 200_000)
 
@@ -94,6 +114,10 @@ NAMED = [
     ("scannet", renumbered, f"frame {HUGE} at 30 Hz, expected one within 146 years"),
     ("scannet", swapped("intrinsic/intrinsic_depth.txt", r"^\S+", "nan"), "intrinsic_depth.txt: camera PinholeCamera"),
     ("scannetpp", photographed_twice, "json: found DSC00001.JPG 2 times, expected every image once"),
+    ("scannetpp", stated(camera_model="OPENCV_FISHEYE"), "json: camera_model is 'OPENCV_FISHEYE', expected 'PINHOLE'"),
+    ("scannetpp", stated(camera_model="OPENCV", k1=0.0, k2=-0.02), "json: k2 is -0.02, expected 0, as of undistorted"),
+    ("scannetpp", stated(k1="x"), "json: k1 is 'x', expected 0, as of undistorted images"),
+    ("scannetpp", said_bad("false"), "json: is_bad of DSC00001.JPG is 'false', expected true or false"),
     ("scannetpp", nested, "transforms_undistorted.json: not valid JSON"),
     ("tum", added("rgb.txt", "1e999999 rgb/y.png\n"), "rgb.txt:10: '1e999999', expected a time in seconds before"),
     ("tum", added("groundtruth.txt", "1e8 1e300 0 0 0 0 0 1\n"), "groundtruth.txt:35: is 1e+300 m away"),
@@ -135,6 +159,18 @@ def test_of_one_time_the_last_pose_counts(tmp_path: Path) -> None:
     poses = Poses.read(file)
     assert poses.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000]
     assert poses.T_world_body[:, 0, 3].tolist() == [3.0, 5.0]
+
+
+@pytest.mark.parametrize("quaternion", ["0 1e200 0 1e200", "0 0 0 525", "0 0 0 0.01"])
+def test_a_pose_whose_quaternion_is_none_counts_as_no_pose(tmp_path: Path, quaternion: str) -> None:
+    """Its length would be infinite, and its rotation none."""
+    file = tmp_path / "groundtruth.txt"
+    file.write_text(f"1.0 1 0 0 0 0 0 1\n2.0 5 0 0 {quaternion}\n")
+    poses = Poses.read(file)
+    assert (poses.stamps_ns.tolist(), poses.unusable) == ([1_000_000_000], 1)
+    file.write_text(f"2.0 5 0 0 {quaternion}\n")
+    with pytest.raises(DuagError, match="found no pose"):
+        Poses.read(file)
 
 
 def test_numbers_of_frames_become_times_of_this_century() -> None:
