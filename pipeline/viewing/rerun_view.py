@@ -7,13 +7,16 @@ the distortion of its lens.
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -193,15 +196,7 @@ def _open_window(rrd: Path) -> None:
     Raises:
         DuagError: there is no viewer, or it could not open a window.
     """
-    command = [
-        _executable(),
-        "--bind",
-        "127.0.0.1",
-        "--port",
-        str(_free_port()),
-        "--memory-limit",
-        VIEWER_MEMORY,
-    ]
+    command = [_executable(), *_served(_free_port())]
     done = subprocess.run([*command, str(rrd)], check=False, stderr=subprocess.PIPE, text=True)
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
@@ -209,6 +204,11 @@ def _open_window(rrd: Path) -> None:
             f"{rrd.name}: the viewer ended with {done.returncode} ({lines[-1] if lines else 'no word'}); "
             "on a machine without a display use --save or --screenshot"
         )
+
+
+def _served(port: int) -> list[str]:
+    """Options of a viewer that listens on this machine only."""
+    return ["--bind", "127.0.0.1", "--port", str(port), "--memory-limit", VIEWER_MEMORY]
 
 
 def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
@@ -222,29 +222,56 @@ def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
     Raises:
         DuagError: there is no graphics driver, or the viewer has not shown the data in time.
     """
-    from rerun.experimental import ViewerClient
-
-    executable = _executable()
-    try:
-        with ViewerClient.spawn(
-            headless=True, port=_free_port(), memory_limit=VIEWER_MEMORY, executable_path=executable
-        ) as viewer:
-            viewer.open(str(rrd))
-            data = _settled_picture(viewer, timeout_s)
-    except Exception as error:  # the client raises RuntimeError and its own kinds, with the viewer's words
-        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise DuagError(
-            f"{png}: the viewer drew no picture ({first}); it needs a graphics driver, "
-            "for example the package mesa-vulkan-drivers"
-        ) from error
+    command = [_executable(), *_served(port := _free_port()), "--headless"]
+    with tempfile.TemporaryFile() as said:
+        quiet = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said}
+        environment = os.environ | {"RERUN_APP_ONLY": "true"}
+        viewer = subprocess.Popen(command, env=environment, start_new_session=True, **quiet)
+        try:
+            data = _picture(viewer, port, rrd, time.monotonic() + timeout_s)
+        except Exception as error:  # the client raises RuntimeError and its own kinds
+            said.seek(0)
+            why = _last_words(said.read().decode(errors="replace"), str(error) or type(error).__name__)
+            raise DuagError(
+                f"{png}: the viewer drew no picture ({why}); it needs a graphics driver, "
+                "for example the package mesa-vulkan-drivers"
+            ) from error
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGKILL)  # the command may be one that starts the viewer
+            viewer.wait()
     with new_file(png) as part:
         part.write_bytes(data)
 
 
-def _settled_picture(viewer: Any, timeout_s: float) -> bytes:
+def _picture(viewer: subprocess.Popen[bytes], port: int, rrd: Path, end_s: float) -> bytes:
+    """The picture that a viewer draws of a file, once it listens."""
+    from rerun.experimental import ViewerClient
+
+    while True:
+        if viewer.poll() is not None:
+            raise RuntimeError(f"it ended with {viewer.returncode}")
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                break
+        if time.monotonic() > end_s:
+            raise RuntimeError("it does not listen")
+        time.sleep(0.1)
+    client = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
+    client.open(str(rrd))
+    return _settled_picture(client, end_s)
+
+
+def _last_words(said: str, otherwise: str) -> str:
+    """Why a viewer ended: of what it said the line of its panic, else the first line of another text."""
+    lines = [line.strip() for line in said.splitlines() if "panicked at" in line]
+    return lines[0] if lines else otherwise.strip().splitlines()[0]
+
+
+def _settled_picture(viewer: Any, end_s: float) -> bytes:
     """The picture once it does not change any more: what is on disk is drawn piece by piece."""
-    end, last = time.monotonic() + timeout_s, b""
-    while time.monotonic() < end:
+    last = b""
+    while time.monotonic() < end_s:
         data = viewer.take_screenshot()
         if data == last:
             return data

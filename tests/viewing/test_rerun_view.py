@@ -198,16 +198,30 @@ def test_what_is_neither_a_run_nor_a_recording_is_an_error(tmp_path):
         rerun_view.view(tmp_path, save=tmp_path / "out.rrd")
 
 
-def test_a_machine_that_cannot_draw_says_so(fake, tmp_path, monkeypatch):
-    from rerun.experimental import ViewerClient
-
-    def panic(**_):
-        raise RuntimeError("No graphics adapter was found\nmore")
-
-    monkeypatch.setattr(ViewerClient, "spawn", panic)
-    with pytest.raises(DuagError, match=r"No graphics adapter was found.*mesa-vulkan-drivers"):
+def test_a_machine_that_cannot_draw_says_so(fake, tmp_path, monkeypatch, capfd):
+    """What the viewer says by itself is not shown, but for why it ended."""
+    viewer = tmp_path / "viewer"
+    viewer.write_text(
+        "#!/bin/sh\necho $* > $0.arguments\necho INFO\nsleep 600 &\necho $! > $0.child\n"
+        "printf \"\\nthread 'main' panicked at 'No graphics adapter was found'\\n6: panic\\n\" >&2\nexit 134\n"
+    )
+    viewer.chmod(0o755)
+    monkeypatch.setattr(rerun_view, "_executable", lambda: str(viewer))
+    with pytest.raises(
+        DuagError, match=r"panicked at 'No graphics adapter was found'\); .*mesa-vulkan-drivers"
+    ):
         rerun_view.view(fake.recording, screenshot=tmp_path / "out.png")
-    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+    assert "--bind 127.0.0.1 --port" in (tmp_path / "viewer.arguments").read_text()
+    assert not (tmp_path / "out.png").exists()
+    state = Path("/proc") / (tmp_path / "viewer.child").read_text().strip() / "stat"
+    assert not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def test_a_viewer_that_is_silent_is_named_by_how_it_ended(fake, tmp_path, monkeypatch):
+    monkeypatch.setattr(rerun_view, "_executable", lambda: "/bin/false")
+    with pytest.raises(DuagError, match=r"drew no picture \(it ended with 1\)"):
+        rerun_view.view(fake.recording, screenshot=tmp_path / "out.png")
 
 
 def test_a_window_that_does_not_open_is_an_error(fake, monkeypatch):
