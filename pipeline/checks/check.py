@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks import estimate, geometry, gyroscope, images, measured, moves, scale, stamps
 from duagc.pipeline.checks.findings import Finding, Report, Severity, judged, lines
@@ -48,6 +49,7 @@ def check(path: str | Path, config: ChecksConfig = _DEFAULT, *, store: str | Pat
     Raises:
         DuagError: it is neither. Everything else that is wrong is a finding.
     """
+    determinism.configure_opencv()
     path = Path(path)
     report = Report(str(path))
     recording = None if path.is_file() else Recording(path)

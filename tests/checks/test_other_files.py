@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,6 +26,14 @@ def test_what_is_no_log_is_not_to_be_recovered(
     (tmp_path / name).write_bytes(content)
     (finding,) = check.check(tmp_path / name).findings
     assert (finding.severity, finding.advice) == ("error", advice)
+
+
+def test_a_check_leaves_no_thread_of_opencv_behind(tmp_path: Path) -> None:
+    """A copy of the process would wait for it, and loops of several threads need not keep their order."""
+    cv2.setNumThreads(2)
+    (tmp_path / "alpha.mcap").touch()
+    check.check(tmp_path / "alpha.mcap")
+    assert cv2.getNumThreads() == 1
 
 
 def test_a_sound_log_without_a_camera_is_not_to_be_recovered(tmp_path: Path) -> None:
