@@ -72,6 +72,7 @@ class RobotWriter:
         self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
         self._truth = TruthWriter(self.folder, name, self.depth_scale, self._files)
         self._has_depth = self._has_sigma = False
+        self._measures = False  # whether any depth or point says something
         self._valid = mask_of_user(name, camera.width, camera.height)
         self._regions = FoundRegions() if find_regions else None
         self._lens: Lens | None = None
@@ -213,6 +214,7 @@ class RobotWriter:
         if not self._has_depth:
             self._log.channel(topic, topics.DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)})
             self._has_depth = True
+        self._measures = self._measures or bool(depth.any())
         self._log.write(topic, messages.pack_depth(taken_ns, self.name, depth), stamp_ns, taken_ns)
         if sigma_m is not None:
             self._add_sigma(stamp_ns, taken_ns, depth, sigma_m)
@@ -255,6 +257,7 @@ class RobotWriter:
         if self._announce(topics.RAW_DEPTH_TRANSFORM, stamp_ns, "depth_camera"):
             calibration = messages.pack_calibration(stamp_ns, self.name, camera)
             self._log.write(topics.RAW_DEPTH_CALIBRATION.of(self.name), calibration, stamp_ns)
+        self._measures = self._measures or bool(depth.any())
         message = messages.pack_depth(stamp_ns, self.name, depth)
         self._log.write(topics.RAW_DEPTH.of(self.name), message, stamp_ns)
 
@@ -276,6 +279,7 @@ class RobotWriter:
             stamp_ns: its time, at which all points were measured.
             points_lidar: [n, 3], m, LiDAR frame.
         """
+        self._measures = self._measures or len(points_lidar) > 0
         self._announce(topics.LIDAR_TRANSFORM, stamp_ns, "lidar")
         points = messages.pack_points(stamp_ns, f"{self.name}/lidar", points_lidar)
         self._log.write(topics.LIDAR.of(self.name), points, stamp_ns)
@@ -357,6 +361,7 @@ class RobotWriter:
             "digests": {self._log.path.name: self._log.digest, **self._truth.digests},
             "path": self._truth.path,
             "color_digests": sorted(self._colors),
+            "measures": self._measures,
         }
         if self._valid is not None:
             summary["masked_share"] = float(np.mean(~self._valid))

@@ -145,6 +145,11 @@ class RecordingWriter:
         row = dict(summary)
         robot = row.pop("robot")
         self._colors[robot] = set(row.pop("color_digests"))
+        if not row.pop("measures"):
+            self.warnings.append(
+                f"{robot}: none of {row['frames']} frames has any depth (0, and the largest number, are none); "
+                "expected some, or no map can be made"
+            )
         if robot in self._robots:
             raise ValueError(f"robot {robot} is in the recording already")
         for name, words in FOUND.items():

@@ -45,6 +45,8 @@ WIDTH, HEIGHT = 640, 480
 DEPTH_SCALE = 0.001
 FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)")
 SEQUENCE_FOLDER = re.compile(r"seq-(\d+)")
+OTHER_CAMERAS = "info.txt"  # BundleFusion has the same names of frames, and its cameras in this file
+FOCAL_LENGTHS = {"depth_focal_px", "color_focal_px"}
 KINDS = ("color", "depth", "pose")
 MOST_NUMBERS = 10_000_000  # four days
 
@@ -192,6 +194,12 @@ def _parts(
     warnings: list[str] = []
     sequences = []
     for folder in folders:
+        if (folder / OTHER_CAMERAS).is_file() and not options.model_fields_set >= FOCAL_LENGTHS:
+            raise DuagError(
+                f"{folder / OTHER_CAMERAS}: found, as in BundleFusion, with other cameras than 7-Scenes; "
+                "expected --set depth_focal_px=, color_focal_px= and the other numbers of its cameras, baseline_m=0 if "
+                "depth is registered"
+            )
         frames, missing = list_frames(folder)
         frames = options.first(frames)
         missing = [number for number in missing if number < frames[-1].number]

@@ -25,6 +25,8 @@ from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.pairing import TOLERANCE_KEY, TOLERANCE_NS, nearest_indices
 
+LISTS = "rgb.txt", "depth.txt"
+
 
 class AssociationOptions(Config):
     """Which depth image belongs to which color image, and where the camera was."""
@@ -279,7 +281,13 @@ def frames_of(src: Path, options: SequenceOptions) -> tuple[list[FrameFiles], Po
     """
     if not src.is_dir():
         raise DuagError(f"{src}: no such folder, expected rgb.txt, depth.txt and groundtruth.txt in it")
-    color, depth = options.first(read_list(src / "rgb.txt")), read_list(src / "depth.txt")
+    for name in LISTS:
+        if not (src / name).is_file():
+            found = ", ".join(sorted(path.name for path in src.glob("*.txt"))) or "no list"
+            raise DuagError(
+                f"{src / name}: No such file, but {found}; expected {' and '.join(LISTS)}, as TUM has them"
+            )
+    color, depth = options.first(read_list(src / LISTS[0])), read_list(src / LISTS[1])
     pairs: list[tuple[Listed, Listed | None]] = list(associate(color, depth, options))
     if not pairs:
         raise DuagError(

@@ -199,6 +199,30 @@ def test_missing_parts_of_a_recording(tmp_path: Path) -> None:
         Recording(out).log("alpha")
 
 
+@pytest.mark.parametrize("value", [0, 1])
+@pytest.mark.parametrize("sensor", ["registered", "of its own", "lidar"])
+def test_a_robot_without_any_depth_is_named(tmp_path: Path, sensor: str, value: int) -> None:
+    raw = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
+    raw[0, 0] = value
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as writer:
+        if sensor == "of its own":
+            writer.set_depth_camera(CAMERA, np.eye(4), 0.001)
+            writer.add_depth(0, raw)
+        if sensor == "lidar":
+            writer.set_lidar(np.eye(4), None)
+            writer.add_points(0, np.ones((value, 3)))
+        for k in range(2):
+            shown = raw if sensor == "registered" else None
+            writer.add_frame(1000 * (k + 1), png(image(k)), "png", shown)
+    words = (
+        "alpha: none of 2 frames has any depth (0, and the largest number, are none); expected some, or no map can be "
+        "made"
+    )
+    description = Recording(tmp_path / "rec").description
+    assert description["warnings"] == ([] if value else [words])
+    assert "measures" not in description["robots"]["alpha"]
+
+
 def test_robots_with_the_same_images_are_named(tmp_path: Path) -> None:
     """One recording given twice; images of no light may be the same."""
 

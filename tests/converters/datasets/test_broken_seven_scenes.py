@@ -89,6 +89,18 @@ def test_broken_files_are_named(
     assert [p.name for p in tmp_path.iterdir()] == ["seq-01"], "nothing is left behind"
 
 
+def test_the_cameras_of_bundle_fusion_must_be_stated(broken: Path, tmp_path: Path) -> None:
+    """Its frames have the same names; with other cameras depth would move by centimeters, without a word."""
+    (broken / "info.txt").write_text(
+        "m_calibrationColorIntrinsic = 583 0 320 0 0 583 240 0 0 0 1 0 0 0 0 1\n"
+    )
+    with pytest.raises(
+        DuagError, match=r"info.txt: found, as in BundleFusion, .*--set depth_focal_px=, color_focal"
+    ):
+        convert(broken, tmp_path / "rec", depth_focal_px=585.0)
+    convert(broken, tmp_path / "rec", depth_focal_px=585.0, color_focal_px=525.0)
+
+
 def inverted(T: np.ndarray) -> np.ndarray:
     return se3.inverse(se3.from_rotation_translation(so3.project(T[:3, :3]), T[:3, 3]))
 

@@ -95,6 +95,11 @@ def said_bad(word: object) -> Spoil:
     return say
 
 
+def of_open_loris(p: Path) -> None:
+    (p / "rgb.txt").rename(p / "color.txt")
+    (p / "depth.txt").unlink()
+
+
 def nested(p: Path) -> None:
     next(p.rglob("*.json")).write_text("[" * 200_000)
 
@@ -119,6 +124,7 @@ NAMED = [
     ("scannetpp", stated(k1="x"), "json: k1 is 'x', expected 0, as of undistorted images"),
     ("scannetpp", said_bad("false"), "json: is_bad of DSC00001.JPG is 'false', expected true or false"),
     ("scannetpp", nested, "transforms_undistorted.json: not valid JSON"),
+    ("tum", of_open_loris, "rgb.txt: No such file, but color.txt, groundtruth.txt; expected rgb.txt and depth.txt"),
     ("tum", added("rgb.txt", "1e999999 rgb/y.png\n"), "rgb.txt:10: '1e999999', expected a time in seconds before"),
     ("tum", added("groundtruth.txt", "1e8 1e300 0 0 0 0 0 1\n"), "groundtruth.txt:35: is 1e+300 m away"),
 ]  # fmt: skip
