@@ -224,9 +224,10 @@ def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
     """
     command = [_executable(), *_served(port := _free_port()), "--headless"]
     with tempfile.TemporaryFile() as said:
-        quiet = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said}
         environment = os.environ | {"RERUN_APP_ONLY": "true"}
-        viewer = subprocess.Popen(command, env=environment, start_new_session=True, **quiet)
+        viewer = subprocess.Popen(
+            command, env=environment, stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True
+        )
         try:
             data = _picture(viewer, port, rrd, time.monotonic() + timeout_s)
         except Exception as error:  # the client raises RuntimeError and its own kinds
