@@ -20,7 +20,9 @@ from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
 from duagc.pipeline.recording import RgbdLog, open_rgbd
 from duagc.pipeline.recording.rolling_shutter import Readout, share_of_readout
 from duagc.pipeline.registration.definition import SAME_SURFACE
-from duagc.pipeline.registration.features import gray_of, matches, nearest_pixel, strongest_keypoints
+from duagc.pipeline.registration.descriptors import matches
+from duagc.pipeline.registration.features import gray_of
+from duagc.pipeline.registration.keypoints import nearest_pixel, strongest_keypoints
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 FEATURES = 1200

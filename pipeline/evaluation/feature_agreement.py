@@ -20,7 +20,8 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.registration.features import Features, extract, matches
+from duagc.pipeline.registration.descriptors import matches
+from duagc.pipeline.registration.features import Features, extract
 from duagc.pipeline.registration.matched_points import ransac
 
 FEATURES = 600

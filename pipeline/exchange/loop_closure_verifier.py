@@ -23,7 +23,7 @@ from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.posegraph.loop_closures import Consistency, Group, KeyframePoses, consistent
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
-from duagc.pipeline.registration.features import Descriptors, matches
+from duagc.pipeline.registration.descriptors import Descriptors, matches
 
 NOTHING_SHARED = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
 

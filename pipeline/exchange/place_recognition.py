@@ -24,7 +24,8 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.exchange import PlacesConfig
-from duagc.pipeline.registration.features import Descriptors, Features, matches
+from duagc.pipeline.registration.descriptors import Descriptors, matches
+from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.place_index import PlaceIndex
 
 FIRST_SIGMA = np.array([10.0, 1.0])  # of the relative frame before anything is known (m, rad)

@@ -11,7 +11,8 @@ from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.hidden_pixels import HiddenPixels
 from duagc.pipeline.registration import Level, Registration, RgbdPyramid
-from duagc.pipeline.registration.features import Detections, Features, extract_from_pyramid, has_few_depths
+from duagc.pipeline.registration.features import Features, extract_from_pyramid, has_few_depths
+from duagc.pipeline.registration.keypoints import KeptKeypoints
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class CurrentFrame:
         hidden: what an object in front of the camera hides, which the images are without; None: nothing known.
         whole: its coarsest image before.
         suspected: what an object may hide, of a frame with whole images; None: nothing.
-        detections: keypoints of its images, for the frame without some pixels, too.
+        keypoints: of its images, for the frame without some pixels, too.
     """
 
     frame_index: int
@@ -38,7 +39,7 @@ class CurrentFrame:
     hidden: HiddenPixels | None = None
     whole: Level | None = None
     suspected: HiddenPixels | None = None
-    detections: Detections = field(default_factory=Detections)
+    keypoints: KeptKeypoints = field(default_factory=KeptKeypoints)
 
     @property
     def seen(self) -> Level:
@@ -67,7 +68,7 @@ class CurrentFrame:
     @cached_property
     def features(self) -> Features:
         """Its features; computed when first needed."""
-        return features_of(self.pyramid, self.relocalization, self.detections)
+        return features_of(self.pyramid, self.relocalization, self.keypoints)
 
     @cached_property
     def has_few_depths(self) -> bool:
@@ -76,7 +77,7 @@ class CurrentFrame:
 
 
 def features_of(
-    pyramid: RgbdPyramid, config: RelocalizationConfig, before: Detections | None = None
+    pyramid: RgbdPyramid, config: RelocalizationConfig, before: KeptKeypoints | None = None
 ) -> Features:
     """The features by which a frame is relocalized, and to which it is compared as a keyframe.
 

@@ -27,9 +27,9 @@ from duagc.pipeline.frontend.reach import farthest_m, fastest_m_s
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import TrackingState
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.descriptors import matches
 from duagc.pipeline.registration.feature_judgment import angles_between
 from duagc.pipeline.registration.feature_motion import features_agree
-from duagc.pipeline.registration.features import matches
 
 
 class PoseCheck(Protocol):

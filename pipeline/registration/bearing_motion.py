@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.registration.features import Features, matches
+from duagc.pipeline.registration.descriptors import matches
+from duagc.pipeline.registration.features import Features
 
 LARGEST_INVERSE_DEPTH = 1 / 0.3
 """1/m: what has no depth may be so near; few sensors measure nearer."""

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import GeometricVerificationConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration.features import Features, matches
+from duagc.pipeline.registration.descriptors import matches
+from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.matched_points import information_of_fit, ransac
 from duagc.pipeline.registration.rectified_features import matched_points
 

@@ -12,7 +12,7 @@ from itertools import islice
 
 import numpy as np
 
-from duagc.pipeline.registration.features import Descriptors
+from duagc.pipeline.registration.descriptors import Descriptors
 from duagc.pipeline.registration.place_recognition import TABLES, WORDS, center_of, words_of
 
 MOST = 64

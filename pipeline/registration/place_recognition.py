@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.registration.features import DIMENSIONS, Descriptors, matches
+from duagc.pipeline.registration.descriptors import DIMENSIONS, Descriptors, matches
 
 TABLES = 8
 DIRECTIONS = 128  # per table, two words each

@@ -18,15 +18,13 @@ from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.image_sampling import sampled
 from duagc.pipeline.geometry.projection import back_project
-from duagc.pipeline.registration.features import (
-    DIMENSIONS,
+from duagc.pipeline.registration.descriptors import DIMENSIONS, matches_of, squared_distances
+from duagc.pipeline.registration.features import Features
+from duagc.pipeline.registration.keypoints import (
     NO_KEYPOINTS,
-    Features,
     Keypoints,
     brightened,
-    matches_of,
     nearest_pixel,
-    squared_distances,
     strongest_keypoints,
 )
 from duagc.pipeline.registration.pyramid import RgbdPyramid

@@ -16,7 +16,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.loop_closures import KeyframePoses
 from duagc.pipeline.posegraph.moved_things import TwoMotions
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
-from duagc.pipeline.registration.features import matches
+from duagc.pipeline.registration.descriptors import matches
 
 CONFIG = LoopClosureConfig()
 PLACE, THING = se3.exp([1.0, 0.2, 0, 0, 0.3, 0]), se3.exp([1.4, 0.2, 0, 0, 0.3, 0])

@@ -23,7 +23,7 @@ from duagc.pipeline.exchange.verification import Verdict, Verified, verify, with
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration import Reference, RgbdPyramid, features
+from duagc.pipeline.registration import Reference, RgbdPyramid, descriptors, features
 from duagc.pipeline.runs.keyframe_images import Images
 from tests.exchange.conftest import CAMERA, path, view
 
@@ -55,7 +55,7 @@ def test_matching_bytes_is_exact() -> None:
     rng = np.random.default_rng(0)
     a, b = (rng.integers(0, 256, (50, 128)).astype(np.uint8) for _ in range(2))
     exact = ((a[:, None].astype(np.int64) - b.astype(np.int64)) ** 2).sum(axis=-1)
-    assert np.array_equal(features.squared_distances(a, b), exact)
+    assert np.array_equal(descriptors.squared_distances(a, b), exact)
 
 
 def test_a_descriptor_matches_itself_only() -> None:
@@ -63,7 +63,7 @@ def test_a_descriptor_matches_itself_only() -> None:
     a = rng.integers(0, 256, (40, 128)).astype(np.uint8)
     noisy = np.clip(a[:20].astype(int) + rng.integers(-3, 4, (20, 128)), 0, 255).astype(np.uint8)
     theirs = np.concatenate([noisy, rng.integers(0, 256, (20, 128)).astype(np.uint8)])
-    assert np.array_equal(features.matches(a, theirs, 0.8), np.stack([np.arange(20)] * 2, axis=1))
+    assert np.array_equal(descriptors.matches(a, theirs, 0.8), np.stack([np.arange(20)] * 2, axis=1))
 
 
 def verified(candidate, database, sample, config=None) -> Verified:

@@ -24,7 +24,8 @@ from duagc.pipeline.registration import (
     place_recognition,
     register,
 )
-from duagc.pipeline.registration.features import Features, matches
+from duagc.pipeline.registration.descriptors import matches
+from duagc.pipeline.registration.features import Features
 from tests.fixtures.room import pose, render
 
 CAMERA = PinholeCamera(320, 240, 220.0, 220.0, 159.5, 119.5)

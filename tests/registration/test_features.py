@@ -6,13 +6,9 @@ import pytest
 
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.registration import RgbdPyramid
-from duagc.pipeline.registration.features import (
-    brightened,
-    extract,
-    extract_from_pyramid,
-    has_few_depths,
-    matches,
-)
+from duagc.pipeline.registration.descriptors import matches
+from duagc.pipeline.registration.features import extract, extract_from_pyramid, has_few_depths
+from duagc.pipeline.registration.keypoints import brightened
 
 CAMERA = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5)
 DEPTH = np.full((120, 160), 2.0, np.float32)

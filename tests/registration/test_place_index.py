@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.exchange import place_recognition
-from duagc.pipeline.registration import features
+from duagc.pipeline.registration import descriptors
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.place_index import ENTRIES, MOST, PlaceIndex
 
@@ -62,14 +62,14 @@ def test_a_query_compares_no_more_with_four_times_the_views(
     views: tuple[list[np.ndarray], list[np.ndarray]], large: PlaceIndex, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     distances = 0
-    squared = features.squared_distances
+    squared = descriptors.squared_distances
 
     def counted(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
         nonlocal distances
         distances += len(ours) * len(theirs)
         return squared(ours, theirs)
 
-    monkeypatch.setattr(features, "squared_distances", counted)
+    monkeypatch.setattr(descriptors, "squared_distances", counted)
     cost = []
     for count in (100, 400):
         own = [Features(d, np.zeros((len(d), 3), np.float32)) for d in views[0][:count]]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.frontend import LoopConfig
-from duagc.pipeline.registration.features import matches
+from duagc.pipeline.registration.descriptors import matches
 from duagc.pipeline.registration.place_recognition import Places
 
 

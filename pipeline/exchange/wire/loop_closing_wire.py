@@ -15,7 +15,8 @@ from duagc.pipeline.exchange.wire.reader import MAX_KEYFRAMES, Reader, motion_by
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.registration import Reference, ReferenceLevel
-from duagc.pipeline.registration.features import DIMENSIONS, Descriptors, Features
+from duagc.pipeline.registration.descriptors import DIMENSIONS, Descriptors
+from duagc.pipeline.registration.features import Features
 
 DIGEST_BYTES = 8
 LEAST_METRIC = 1e-12  # 1/m^2: a deviation as large as the largest coordinate
