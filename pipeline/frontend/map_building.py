@@ -40,7 +40,6 @@ from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdFrame, RgbdLog
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.training_frames import seen_distance_m
 
 Result = TypeVar("Result")
 
@@ -99,24 +98,23 @@ class MapBuilder:
         self._poses = {k.frame_index: k.T_map_camera for k in keyframes}
         self._sights.look(keyframes)
         self._tiles = self._sights.tiles()
-        save, config, threads = self._checkpoints, self.config, self._threads
+        log, save, config, threads = self.log, self._checkpoints, self.config, self._threads
         updates, state = save.done(f"{self.name}.mapping", self._grown)
         self._whole.go_on(state)
         del state  # or it would be in memory twice
         unrefined = self._whole.gaussians
         clock.lap("mapping_s")
-        gain = ViewGain(unrefined, self._depth, self.log.camera, config.mapping, threads)
+        gain = ViewGain(unrefined, self._depth, log.camera, config.mapping, threads)
         supporting = supporting_frames(
             frames, keyframes, config, gain, tiles=len(self._tiles), seed=self._seed
         )
-        path = tracked_path(frames, np.array([k.T_map_camera for k in keyframes]))
-        search = ShutterSearch(
-            self.log, config.mapping, path, self._posed, depth=self._depth, threads=threads
-        )
+        before = np.array([k.T_map_camera for k in keyframes])
+        path = tracked_path(frames, before)
+        search = ShutterSearch(log, config.mapping, path, self._posed, depth=self._depth, threads=threads)
         shutter_s = save.done(
             f"{self.name}.shutter", lambda: search.run(self._whole.gaussians, supporting, keyframes)
         )
-        self.log.open_shutter(shutter_s, path)
+        log.open_shutter(shutter_s, path)
         log_s = 1e-9 * (frames[-1].stamp_ns - frames[0].stamp_ns)
         stats, self._poses, state = save.done(
             f"{self.name}.final", lambda: self._finalized(supporting, log_s)
@@ -126,7 +124,6 @@ class MapBuilder:
         updates.append(stats.message(keyframes[-1], self.name, len(self._whole)))
         clock.lap("final_refinement_s")
         maps = Maps(self._whole.gaussians, unrefined, self._depth)
-        before = np.array([k.T_map_camera for k in keyframes])
         after = np.array([self._poses[k.frame_index] for k in keyframes])
         if not np.array_equal(before, after):
             frames = moved_frames(frames, before, after, self._poses)
@@ -223,21 +220,13 @@ class MapBuilder:
         self, supporting: Sequence[TrackedFrame], log_s: float
     ) -> tuple[MappingStats, dict[int, Array], Any]:
         """Optimize all tiles in turn; counts, poses of the views by frame index, and the state of the map."""
-        part, every = f"{self.name}.final", range(len(self._keyframes))
+        part, count = f"{self.name}.final", len(self._keyframes)
         tile_of = {k: number for number, tile in enumerate(self._tiles) for k in tile}
         of_tile = [[f for f in supporting if tile_of[f.keyframe_index] == n] for n in range(len(self._tiles))]
-        shares_s = [log_s * len(t) / len(every) if len(self._tiles) > 1 else log_s for t in self._tiles]
-        borders = [len(self._border(tile, every)) for tile in self._tiles]
-        plans = [
-            self._budget.final_steps(len(tile), len(tile) + len(between) + near, share_s)
-            for tile, between, near, share_s in zip(self._tiles, of_tile, borders, shares_s, strict=True)
-        ]
-        wanted, steps = (sum(counts) for counts in zip(*plans, strict=True))
-        self._budget.say_left_out(
-            self._checkpoints.say, self.name, (wanted - steps, wanted), "final_megapixels_s"
-        )
-        joint_share = self.config.mapping.joint_share if len(self._tiles) > 1 else 0.0
-        alone = [alone_steps(taken, joint_share) for _, taken in plans]
+        shares_s = [log_s * len(t) / count if len(self._tiles) > 1 else log_s for t in self._tiles]
+        taken = self._final_steps(of_tile, shares_s)
+        steps, joint_share = sum(taken), self.config.mapping.joint_share if len(self._tiles) > 1 else 0.0
+        alone = [alone_steps(of_one, joint_share) for of_one in taken]
         first, found = 0, None
         all_stats: list[MappingStats] = []
         if (saved := self._checkpoints.resume(part)) is not None:
@@ -263,6 +252,28 @@ class MapBuilder:
             save = TileCheckpoints(self._checkpoints, done, found=found, before=sum(alone), total=steps)
             stats = self._trained_jointly(supporting, steps - sum(alone), save, stats)
         return replace(stats, total=len(self._whole)), self._poses, self._whole.state()
+
+    def _final_steps(
+        self, supporting: Sequence[Sequence[TrackedFrame]], shares_s: Sequence[float]
+    ) -> list[int]:
+        """Steps of each tile in the final optimization; what a budget leaves out is said.
+
+        Args:
+            supporting: frames between the keyframes of each tile.
+            shares_s: of the time that the log took to record.
+        """
+        every = range(len(self._keyframes))
+        plans = [
+            self._budget.final_steps(
+                len(tile), len(tile) + len(between) + len(self._border(tile, every)), share_s
+            )
+            for tile, between, share_s in zip(self._tiles, supporting, shares_s, strict=True)
+        ]
+        wanted, taken = (sum(counts) for counts in zip(*plans, strict=True))
+        self._budget.say_left_out(
+            self._checkpoints.say, self.name, (wanted - taken, wanted), "final_megapixels_s"
+        )
+        return [of_one for _, of_one in plans]
 
     def _mapper_of_all_views(self, number: int, supporting: Sequence[TrackedFrame], *, taken: bool) -> Mapper:
         """A tile's mapper with all views; its Gaussians are taken out of the whole map, or a checkpoint has them."""
@@ -384,17 +395,6 @@ class MapBuilder:
             registration=self.config.tracking.registration,
             threads=self._threads,
         )
-        worth = [frame for frame in frames if model.is_worth(frame, views)]
-        placed = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in worth]
-        distance_m = seen_distance_m(self._whole.gaussians, T_map_keyframe)
-        drawn = model.drawn_from(np.array(placed).reshape(-1, 4, 4), distance_m)
-        T_map_view = {frame.frame_index: T for frame, T in zip(worth, drawn, strict=True)}
-
-        def registered(frame: TrackedFrame) -> TrackedFrame:
-            if frame.frame_index not in T_map_view:
-                return frame
-            color = self.log.frame(frame.frame_index, depth=False)
-            anchor = T_map_keyframe[frame.keyframe_index]
-            return model.register(frame, color, anchor, T_map_view[frame.frame_index])
-
+        others = [frame for frame in frames if frame.frame_index not in views]
+        registered = model.registration_of(others, T_map_keyframe, self.log)
         return self._checkpoints.each(f"{self.name}.model", frames, registered)

@@ -8,6 +8,7 @@ What tracking knew is the prior. The frames that made the map stay where its opt
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import SupportsIndex
 
@@ -23,9 +24,10 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.image_motion import nearby_cameras
 from duagc.pipeline.kernels import Rasterizer
-from duagc.pipeline.recording import RgbdFrame
+from duagc.pipeline.recording import RgbdFrame, RgbdLog
 from duagc.pipeline.registration import Reference, RegistrationConfig, RgbdPyramid, register
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.training_frames import seen_distance_m
 
 
 class ModelTracker:
@@ -60,16 +62,35 @@ class ModelTracker:
         self._rasterizer = Rasterizer(threads=threads)
         self._last: tuple[bytes, Reference] | None = None
 
-    def is_worth(self, tracked: TrackedFrame, views: frozenset[int]) -> bool:
-        """Whether the color of a frame may say more than tracking.
+    def registration_of(
+        self, frames: Iterable[TrackedFrame], T_map_keyframe: Array, log: RgbdLog
+    ) -> Callable[[TrackedFrame], TrackedFrame]:
+        """What registers frames one by one; those stay as tracked whose color does not say more, and all others.
 
         Args:
-            tracked: any frame of the log.
-            views: indices of the frames that made the map.
+            frames: in order of time, without those that made the map.
+            T_map_keyframe: [k, 4, 4], of the keyframes that they are anchored to.
+            log: that has their color.
         """
+        T_map_view = self._views_of(frames, T_map_keyframe)
+
+        def registered(frame: TrackedFrame) -> TrackedFrame:
+            if frame.frame_index not in T_map_view:
+                return frame
+            color = log.frame(frame.frame_index, depth=False)
+            anchor = T_map_keyframe[frame.keyframe_index]
+            return self.register(frame, color, anchor, T_map_view[frame.frame_index])
+
+        return registered
+
+    def _views_of(self, frames: Iterable[TrackedFrame], T_map_keyframe: Array) -> dict[int, Array]:
+        """Where the map is drawn, [4, 4] by frame index, for frames whose color may say more than tracking."""
         reasons = {Reason.NO_DEPTH} if self._depth == "ray_plane" else {Reason.NO_DEPTH, Reason.NONE}
-        placed = tracked.status is not Status.LOST and tracked.reason in reasons
-        return placed and tracked.frame_index not in views
+        worth = [frame for frame in frames if frame.status is not Status.LOST and frame.reason in reasons]
+        placed = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in worth]
+        distance_m = seen_distance_m(self._gaussians, T_map_keyframe)
+        drawn = self.drawn_from(np.array(placed).reshape(-1, 4, 4), distance_m)
+        return {frame.frame_index: T for frame, T in zip(worth, drawn, strict=True)}
 
     def drawn_from(self, T_map_camera: Array, distance_m: float) -> Array:
         """Where the map is drawn for frames, [n, 4, 4]: once for all that see nearly the same.
