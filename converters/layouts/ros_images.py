@@ -9,6 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from duagc.converters.layouts.rvl import decoded_rvl
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image, encode_png
 from duagc.pipeline.recording.greatest_depth import without_saturated
@@ -343,7 +344,8 @@ def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] 
     body = data if plain else data[12:]
     encoding = _encoding(text)
     if not plain and not body.startswith(b"\x89PNG"):
-        values = _rvl(body, where)
+        if (values := decoded_rvl(body)) is None:
+            raise UnusableImage(f"{where}: broken RVL depth, expected columns, rows and runs")
     else:
         image = decode_image(body, cv2.IMREAD_UNCHANGED)
         if image is None or image.dtype != np.uint16 or image.ndim != 2:
@@ -357,44 +359,3 @@ def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] 
     _, a, b = struct.unpack("<iff", data[:12])
     with np.errstate(divide="ignore", invalid="ignore"):
         return _sound(np.where(values > 0, a / (values.astype(np.float32) - np.float32(b)), 0.0))
-
-
-def _rvl(body: bytes, where: str) -> NDArray[np.uint16]:
-    """RVL (Wilson 2017): runs of zeros and of differences in nibbles of three bits; columns and rows in front."""
-    broken = f"{where}: broken RVL depth, expected columns, rows and runs"
-    if len(body) < 8:
-        raise UnusableImage(broken)
-    columns, rows = struct.unpack("<II", body[:8])
-    if not 0 < columns * rows <= 1 << 26:
-        raise UnusableImage(broken)
-    words = np.frombuffer(body[8 : 8 + (len(body) - 8) // 4 * 4], "<u4")
-    shifts = np.arange(28, -4, -4, dtype=np.uint32)
-    nibbles = ((words[:, None] >> shifts) & 15).ravel().astype(np.int64)  # the highest nibble comes first
-    ends = np.flatnonzero(nibbles < 8)
-    if not len(ends):
-        raise UnusableImage(broken)
-    starts = np.concatenate([[0], ends[:-1] + 1])
-    nibbles = nibbles[: ends[-1] + 1]
-    place = np.arange(len(nibbles)) - np.repeat(starts, ends - starts + 1)
-    if place.max() > 10:
-        raise UnusableImage(broken)
-    numbers = np.add.reduceat((nibbles & 7) << (3 * place), starts)
-    out = np.zeros(columns * rows, np.int64)
-    at = position = previous = 0
-    while position < len(out):
-        if at + 1 >= len(numbers):
-            raise UnusableImage(broken)
-        zeros, count = int(numbers[at]), int(numbers[at + 1])
-        at += 2
-        position += zeros
-        if position + count > len(out) or at + count > len(numbers):
-            raise UnusableImage(broken)
-        coded = numbers[at : at + count]
-        steps = (coded >> 1) ^ -(coded & 1)
-        values = previous + np.cumsum(steps)
-        out[position : position + count] = values
-        previous = int(values[-1]) if count else previous
-        at, position = at + count, position + count
-    if out.min(initial=0) < 0 or out.max(initial=0) > 65535:
-        raise UnusableImage(broken)
-    return out.reshape(rows, columns).astype(np.uint16)
