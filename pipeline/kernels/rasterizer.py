@@ -22,14 +22,10 @@ from duagc.pipeline.kernels.arguments import (
     check_sums,
     check_type,
     check_wanted,
-    checked_background,
     checked_bytes,
-    checked_camera,
     checked_exposure,
     checked_image,
     checked_isa,
-    checked_mask,
-    checked_pose,
     checked_threads,
     complaint_about,
     refuse_bad_image,
@@ -45,14 +41,10 @@ from duagc.pipeline.kernels.types import (
     Statistics,
     ViewLoss,
 )
-from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
-
-MAX_GAUSSIANS = 2**30
+from duagc.pipeline.kernels.view import View
+from duagc.pipeline.splat.gaussians import Gaussians
 
 _NO_DOUBLES = np.zeros(0)
-_NO_MASK = np.zeros(0, dtype=np.uint8)
-_View = tuple[int, int, tuple[Any, ...]]
-"""Height, width, and what the kernels take of a view, checked."""
 
 
 class Rasterizer:
@@ -110,9 +102,7 @@ class Rasterizer:
         Raises:
             ValueError: an argument that no camera or Gaussian can have; the message names it.
         """
-        view = self._view(
-            gaussians, camera, T_camera_map, background=background, mask=mask, depth_kind=depth_kind
-        )
+        view = View.checked(gaussians, camera, T_camera_map, background, mask=mask, depth_kind=depth_kind)
         return self._render(gaussians, view, NOTHING, SAME_LAYER)
 
     def forward_with_layer(
@@ -146,19 +136,19 @@ class Rasterizer:
         """
         if not (isinstance(tolerance, Real) and 0 <= float(tolerance) <= 1):
             raise ValueError(f"tolerance is {tolerance!r}, expected a number from 0 to 1")
-        view = self._view(
-            gaussians, camera, T_camera_map, background=(0.0, 0.0, 0.0), mask=mask, depth_kind=depth_kind
-        )
-        layer = empty(*view[:2])
+        view = View.checked(gaussians, camera, T_camera_map, mask=mask, depth_kind=depth_kind)
+        layer = empty(view.height, view.width)
         return self._render(gaussians, view, layer, float(tolerance)), layer
 
-    def _render(self, gaussians: Gaussians, view: _View, layer: Image, tolerance: float) -> Render:
-        """Draw a view of `_view`, and the depth of its layer into an array that has pixels."""
-        height, width, of_view = view
+    def _render(self, gaussians: Gaussians, view: View, layer: Image, tolerance: float) -> Render:
+        """Draw a view, and the depth of its layer into an array that has pixels."""
+        height, width = view.height, view.width
         color, depths, alpha = empty(height, width, 3), empty(height, width), empty(height, width)
         self._gaussians = None  # whatever ends the call, nothing may follow on what is half drawn
         images = color, depths, alpha, layer
-        status = self._raster.forward(*arrays_of(gaussians), *of_view, *images, tolerance)
+        status = self._raster.forward(
+            *arrays_of(gaussians), *view.arguments(self.threads), *images, tolerance
+        )
         self._finish(gaussians, (height, width), status)
         return Render(color, depths, alpha)
 
@@ -212,9 +202,8 @@ class Rasterizer:
         Raises:
             ValueError: an argument of a wrong type, shape or value; the message names it.
         """
-        height, width, view = self._view(
-            gaussians, camera, T_camera_map, background=background, mask=mask, depth_kind=depth_kind
-        )
+        view = View.checked(gaussians, camera, T_camera_map, background, mask=mask, depth_kind=depth_kind)
+        height, width = view.height, view.width
         depth_m = checked_image("depth_m", depth_m, (height, width), "the camera")
         measured, optional = NOTHING, dict[str, NDArray[Any]]()
         if color_table is None:
@@ -229,7 +218,16 @@ class Rasterizer:
         weights = np.array([*of_images, *gain_and_offset, loss.surface_weight, closing], np.float32)
         out = outputs_for(gaussians, parameters)
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
-        arguments = [*arrays_of(gaussians), *view, measured, depth_m, weights, values, *out, by_pose]
+        arguments = [
+            *arrays_of(gaussians),
+            *view.arguments(self.threads),
+            measured,
+            depth_m,
+            weights,
+            values,
+            *out,
+            by_pose,
+        ]
         if depth_certainty is not None:
             size = height, width
             optional["certainty"] = checked_image("depth_certainty", depth_certainty, size, "the camera")
@@ -239,28 +237,6 @@ class Rasterizer:
         self._finish(gaussians, (height, width), status)
         self._closed_early = closing > TRANSMITTANCE_MIN
         return view_loss(values, loss), gradients_of(out if parameters else None, by_pose if pose else None)
-
-    def _view(
-        self,
-        gaussians: Gaussians,
-        camera: PinholeCamera,
-        T_camera_map: ArrayLike,
-        *,
-        background: ArrayLike,
-        mask: NDArray[np.bool_] | None,
-        depth_kind: DepthKind,
-    ) -> _View:
-        check_type("gaussians", gaussians, Gaussians)
-        height, width, intrinsics = checked_camera(camera)
-        pose = checked_pose("T_camera_map", T_camera_map)
-        behind = checked_background(background)
-        if not isinstance(depth_kind, str) or depth_kind not in DEPTH_KINDS:
-            raise ValueError(f"depth_kind is {depth_kind!r}, expected one of {', '.join(DEPTH_KINDS)}")
-        if len(gaussians) > MAX_GAUSSIANS:
-            raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
-        wanted = _NO_MASK if mask is None else checked_mask(mask, (height, width))
-        ray_plane, threads = depth_kind == "ray_plane", checked_threads(self.threads)
-        return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, threads)
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
         """Remember what was drawn, or refuse what could not be."""
