@@ -206,7 +206,8 @@ class Algorithm1Solver:
         _, jacobians = least_squares.gradient(self._factors, np.ones(len(self._factors)), self._x)
         tiny = 1e-9 * max(float(np.abs(blocks).max()), 1.0)
         H = least_squares.curvature_matrix(self._factors, jacobians, np.full((n, 6), tiny))
-        H = (H + sparse.block_diag(list(blocks), format="csc")).tocsc()
+        # with one sparse matrix among them, the sum is one, whatever SciPy makes of arrays
+        H = (H + sparse.block_diag([*blocks, sparse.csc_matrix((0, 0))], format="csc")).tocsc()
         delta = -DAMPING * least_squares.factorized(H)(g.ravel()).reshape(-1, 6)
         turn_rad = float(np.linalg.norm(delta[:, 3:], axis=1).max())
         return retract(self._x, delta * min(1.0, self.config.step_limit_rad / max(turn_rad, 1e-12)))

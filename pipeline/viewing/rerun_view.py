@@ -226,7 +226,12 @@ def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
     with tempfile.TemporaryFile() as said:
         environment = os.environ | {"RERUN_APP_ONLY": "true"}
         viewer = subprocess.Popen(
-            command, env=environment, stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
         )
         try:
             data = _picture(viewer, port, rrd, time.monotonic() + timeout_s)

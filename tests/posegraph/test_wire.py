@@ -32,7 +32,7 @@ def test_set_up_messages_come_back():
         back, poses_of_round = state_wire.read_state(data + b"poses", 4)
         assert poses_of_round == b"poses"
         np.testing.assert_array_equal(back.sources, nothing)
-        assert dataclasses.replace(back, sources=nothing) == dataclasses.replace(state, sources=nothing)
+        assert vars(back) | {"sources": None} == vars(state) | {"sources": None}
         assert len(data) == 4 + bool(revoked)
     front = {(0, 4): 0b11, (2, 1): 0, (0, 9): 0b101}
     assert elimination_wire.read_front(elimination_wire.write_front(front), 3) == front
