@@ -171,7 +171,8 @@ class TrackingState:
         followed = last @ se3.exp(self.velocity * elapsed_s) if self._is_fresh(elapsed_s) else last
         motion = self._moved(self.stamp_ns, stamp_ns)
         if motion is None:
-            return Prediction(followed, None, self._deviation_px(elapsed_s, turns=True))
+            turned_rad_s2 = self.config.tracking.prior.angular_acceleration_rad_s2
+            return Prediction(followed, None, self._deviation_px(elapsed_s, turned_rad_s2))
         config, T = self.config.tracking.prior, motion.T_start_stop
         path_m, angle_rad = se3.distance(np.eye(4), T)
         if motion.knows_translation:
@@ -182,7 +183,7 @@ class TrackingState:
         predicted = last @ T
         predicted[:3, 3] = followed[:3, 3]
         information = np.diag([0.0] * 3 + [sigma_rad**-2.0] * 3)
-        return Prediction(predicted, information, self._deviation_px(elapsed_s, turns=False))
+        return Prediction(predicted, information, self._deviation_px(elapsed_s, 0.0))
 
     def _moved(self, start_ns: int, stop_ns: int) -> Motion | None:
         """The motion by other sensors, a gyroscope corrected by the images; None where that says nothing."""
@@ -216,12 +217,10 @@ class TrackingState:
         self.turns = [*self.turns[1 - MOST :], turn]
         self.gyro = GyroCorrection.of(self.turns, stated_sigma_rad_s)
 
-    def _deviation_px(self, elapsed_s: float, *, turns: bool) -> float:
+    def _deviation_px(self, elapsed_s: float, turned_rad_s2: float) -> float:
         """By how much acceleration moves a view off its prediction, pixels of the coarsest image of a registration."""
-        tracking = self.config.tracking
-        turned = tracking.prior.angular_acceleration_rad_s2 if turns else 0.0
-        moved = tracking.prior.acceleration_m_s2 / self.keyframe.median_depth_m
-        return self._coarsest_focal_px * (turned + moved) * 0.5 * elapsed_s**2
+        moved_rad_s2 = self.config.tracking.prior.acceleration_m_s2 / self.keyframe.median_depth_m
+        return self._coarsest_focal_px * (turned_rad_s2 + moved_rad_s2) * 0.5 * elapsed_s**2
 
     def distance_px(self, T_keyframe_camera: Array, T_keyframe_other: Array) -> float:
         """How far two views are apart, pixels of the coarsest image of a registration.
