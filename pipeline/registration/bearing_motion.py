@@ -36,7 +36,7 @@ LEAST_SIGMA_PX = 0.2
 """Least standard deviation of a place in the image where a feature is found."""
 SHARED_SIGMA_PX = 0.5
 """Least standard deviation that a motion is stated by: neighbors share what lenses and shutters move."""
-DEPTH_SIGMA = 0.05
+RELATIVE_DEPTH_SIGMA = 0.05
 """Least standard deviation of the depth of a feature, as a share of it: many lie at edges."""
 LENGTH_SIGMA_M = 0.1
 """Standard deviation of the length of a start: without depth, nothing else says how far a camera went."""
@@ -63,7 +63,7 @@ class BearingMatches:
         given: [n, 3], where one view has them, at a depth of 1: the first one, of the others the second one.
         sought: [n, 2], where the other view has them, at a depth of 1.
         inverse_depth: [n], 1/m, of `given`; NaN: unknown in either view.
-        depth_sigma: [n], standard deviation of their depth, as a share of it; NaN: unknown.
+        relative_depth_sigma: [n], standard deviation of their depth, as a share of it; NaN: unknown.
         forward: how many come first.
         pixel_width: width of a pixel at a depth of 1.
     """
@@ -71,7 +71,7 @@ class BearingMatches:
     given: Array
     sought: Array
     inverse_depth: Array
-    depth_sigma: Array
+    relative_depth_sigma: Array
     forward: int
     pixel_width: float
 
@@ -111,7 +111,7 @@ class BearingMatches:
             np.where(backward[:, None], b, a)[order],
             np.where(backward[:, None], a, b)[order, :2],
             inverse_depth[order],
-            np.maximum(DEPTH_SIGMA, sigma / inverse_depth)[order],
+            np.maximum(RELATIVE_DEPTH_SIGMA, sigma / inverse_depth)[order],
             int(np.count_nonzero(~backward[left])),
             pixel_width,
         )
@@ -333,7 +333,9 @@ class _Residuals:
         z = np.where(behind, 1.0, q[..., 2])
         place = q[..., :2] / z[..., None]
         moved = place - far[..., :2] / np.maximum(far[..., 2:], NEAREST)
-        by_depth = np.hypot(1.0, matched.depth_sigma / LEAST_SIGMA_PX / matched.pixel_width * _length(moved))
+        by_depth = np.hypot(
+            1.0, matched.relative_depth_sigma / LEAST_SIGMA_PX / matched.pixel_width * _length(moved)
+        )
         share = np.where(is_open, 0.0, np.where(unknown, 1.0, 1 / by_depth))
         axes = np.stack([np.stack([-unit[..., 1], unit[..., 0]], axis=-1), share[..., None] * unit], axis=-2)
         axes /= matched.pixel_width

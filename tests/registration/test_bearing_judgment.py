@@ -5,7 +5,11 @@ import pytest
 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.bearing_judgment import bearings_contradict
-from duagc.pipeline.registration.bearing_motion import DEPTH_SIGMA, BearingMatches, motion_from_bearings
+from duagc.pipeline.registration.bearing_motion import (
+    RELATIVE_DEPTH_SIGMA,
+    BearingMatches,
+    motion_from_bearings,
+)
 
 PIXEL, STEP_M, TILE_M = 1 / 228, 0.8, 0.8
 T_FIRST_SECOND = se3.exp(np.array([0.0, 0.0, STEP_M, 0.0, 0.0, 0.0]))
@@ -23,7 +27,7 @@ def street(far: int, *, passing: int = 0, seed: int = 0) -> BearingMatches:
     second[len(ground) : len(ground) + passing] += (0.9, 0.0, 0.5)
     sought = second[:, :2] / second[:, 2:] + 0.3 * PIXEL * rng.normal(size=(len(second), 2))
     inverse_depth = np.concatenate([1 / ground[:, 2], np.full(far, np.nan)])
-    sigma = np.where(np.isnan(inverse_depth), np.nan, DEPTH_SIGMA)
+    sigma = np.where(np.isnan(inverse_depth), np.nan, RELATIVE_DEPTH_SIGMA)
     return BearingMatches(first / first[:, 2:], sought, inverse_depth, sigma, len(first), PIXEL)
 
 
