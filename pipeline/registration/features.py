@@ -143,6 +143,12 @@ def _with_depth(found: Keypoints, depth_m: NDArray[np.float32], camera: PinholeC
     return Features(found.descriptors, back_project(camera, u, v, z).astype(np.float32))
 
 
+def _rays(found: Keypoints, camera: PinholeCamera) -> NDArray[np.float32]:
+    """Places [n, 3] of keypoints at a depth of 1."""
+    u, v = found.pixels.T
+    return back_project(camera, u, v, np.ones(len(u))).astype(np.float32)
+
+
 def extract_from_pyramid(
     pyramid: RgbdPyramid, max_width_px: int, most: int, *, before: KeptKeypoints | None = None
 ) -> Features:
@@ -170,10 +176,9 @@ def extract_from_pyramid(
     found = find(image, 0) if few else enough_keypoints(image, most, with_depth, find)
     features = _with_depth(found.strongest(most, with_depth), depth_m, level.camera)
     others = found.strongest(most, without)
-    rays = _with_depth(others, np.ones_like(depth_m), level.camera).points
     bearings = Bearings(
         others.descriptors,
-        rays,
+        _rays(others, level.camera),
         pixel_width=1 / level.camera.fx,
         few_depths=few,
         inverse_depth_sigma=levels[-1].inverse_depth_sigma,
