@@ -30,6 +30,7 @@ from duagc.pipeline.kernels.arguments import (
     complaint_about,
     refuse_bad_image,
 )
+from duagc.pipeline.kernels.checked_view import CheckedView
 from duagc.pipeline.kernels.definition import SAME_LAYER, TRANSMITTANCE_MIN
 from duagc.pipeline.kernels.outputs import NOTHING, empty, gradients_of, outputs_for, view_loss, zeros
 from duagc.pipeline.kernels.types import (
@@ -41,7 +42,6 @@ from duagc.pipeline.kernels.types import (
     Statistics,
     ViewLoss,
 )
-from duagc.pipeline.kernels.view import View
 from duagc.pipeline.splat.gaussians import Gaussians
 
 _NO_DOUBLES = np.zeros(0)
@@ -102,7 +102,7 @@ class Rasterizer:
         Raises:
             ValueError: an argument that no camera or Gaussian can have; the message names it.
         """
-        view = View.checked(gaussians, camera, T_camera_map, background, mask=mask, depth_kind=depth_kind)
+        view = CheckedView.of(gaussians, camera, T_camera_map, background, mask=mask, depth_kind=depth_kind)
         return self._render(gaussians, view, NOTHING, SAME_LAYER)
 
     def forward_with_layer(
@@ -136,11 +136,11 @@ class Rasterizer:
         """
         if not (isinstance(tolerance, Real) and 0 <= float(tolerance) <= 1):
             raise ValueError(f"tolerance is {tolerance!r}, expected a number from 0 to 1")
-        view = View.checked(gaussians, camera, T_camera_map, mask=mask, depth_kind=depth_kind)
+        view = CheckedView.of(gaussians, camera, T_camera_map, mask=mask, depth_kind=depth_kind)
         layer = empty(view.height, view.width)
         return self._render(gaussians, view, layer, float(tolerance)), layer
 
-    def _render(self, gaussians: Gaussians, view: View, layer: Image, tolerance: float) -> Render:
+    def _render(self, gaussians: Gaussians, view: CheckedView, layer: Image, tolerance: float) -> Render:
         """Draw a view, and the depth of its layer into an array that has pixels."""
         height, width = view.height, view.width
         color, depths, alpha = empty(height, width, 3), empty(height, width), empty(height, width)
@@ -202,7 +202,7 @@ class Rasterizer:
         Raises:
             ValueError: an argument of a wrong type, shape or value; the message names it.
         """
-        view = View.checked(gaussians, camera, T_camera_map, background, mask=mask, depth_kind=depth_kind)
+        view = CheckedView.of(gaussians, camera, T_camera_map, background, mask=mask, depth_kind=depth_kind)
         height, width = view.height, view.width
         depth_m = checked_image("depth_m", depth_m, (height, width), "the camera")
         measured, optional = NOTHING, dict[str, NDArray[Any]]()

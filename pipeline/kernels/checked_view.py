@@ -25,7 +25,7 @@ NO_MASK = np.zeros(0, dtype=np.uint8)
 
 
 @dataclass(frozen=True)
-class View:
+class CheckedView:
     """A camera as the kernels take it.
 
     Attributes:
@@ -47,7 +47,7 @@ class View:
     ray_plane: bool
 
     @staticmethod
-    def checked(
+    def of(
         gaussians: Gaussians,
         camera: PinholeCamera,
         T_camera_map: ArrayLike,
@@ -55,7 +55,7 @@ class View:
         *,
         mask: NDArray[np.bool_] | None,
         depth_kind: DepthKind,
-    ) -> View:
+    ) -> CheckedView:
         """The view of a drawing.
 
         Args:
@@ -78,7 +78,7 @@ class View:
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         drawn = NO_MASK if mask is None else checked_mask(mask, (height, width))
-        return View(
+        return CheckedView(
             height=height,
             width=width,
             pose=pose,
