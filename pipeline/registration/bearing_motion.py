@@ -79,7 +79,9 @@ class BearingMatches:
         return len(self.given)
 
     @staticmethod
-    def of(first: Features, second: Features, ratio: float) -> BearingMatches | None:
+    def of(
+        first: Features, second: Features, ratio: float, *, whatever_has_depth: bool = False
+    ) -> BearingMatches | None:
         """Matches of all features.
 
         Of matches between the same two places one counts: a blob of several orientations has several. None: features
@@ -90,6 +92,7 @@ class BearingMatches:
             first: features of the first view.
             second: features of the second view.
             ratio: of the ratio test.
+            whatever_has_depth: whether matches are wanted though most have depth.
         """
         if min(first.bearings.pixel_width, second.bearings.pixel_width) == 0:
             return None
@@ -100,7 +103,7 @@ class BearingMatches:
         pixel_width = max(first.bearings.pixel_width, second.bearings.pixel_width)
         left = _once(a, b)
         left = left[_moving(np.linalg.norm(a - b, axis=1)[left] / pixel_width)]
-        few = first.bearings.few_depths or second.bearings.few_depths
+        few = whatever_has_depth or first.bearings.few_depths or second.bearings.few_depths
         in_both = np.count_nonzero(~np.isnan(rho_a + rho_b)[left])
         if len(left) < MIN_INLIERS or (in_both > len(left) / 2 and not few):
             return None

@@ -51,7 +51,7 @@ class FeatureMotion:
     @property
     def spread_m(self) -> float:
         """Root of the mean squared distance of the points that agree from their mean."""
-        return _spread_m(self.points)
+        return spread_m(self.points)
 
     @property
     def information(self) -> Array:
@@ -190,12 +190,32 @@ def follows_something_moved(
         config: ratio test, RANSAC, inliers needed.
         rng: draws the samples of RANSAC.
     """
+    return motion_spread_wider(first, second, T_first_second, config=config, rng=rng) is not None
+
+
+def motion_spread_wider(
+    first: Features,
+    second: Features,
+    T_first_second: Array,
+    *,
+    config: GeometricVerificationConfig,
+    rng: np.random.Generator,
+) -> FeatureMotion | None:
+    """The motion of features that are far from a given one, if they spread wider than those that agree with it.
+
+    Args:
+        first: features of the first view.
+        second: features of the second view.
+        T_first_second: the given motion, [4, 4].
+        config: ratio test, RANSAC, inliers needed.
+        rng: draws the samples of RANSAC.
+    """
     points = matched_features(first, second, config)
     another = motion_of_others(T_first_second, *points, config=config, rng=rng)
     if another is None:
-        return False
+        return None
     agree = _apart(*points, T_first_second, config) < 1
-    return another.spread_m > _spread_m(points[1][agree])
+    return another if another.spread_m > spread_m(points[1][agree]) else None
 
 
 def agreeing(
@@ -220,8 +240,12 @@ def _apart(
     return np.asarray(apart_m / (config.inlier_m * np.maximum(1.0, points_first[:, 2])))
 
 
-def _spread_m(points: Array) -> float:
-    """Root of the mean squared distance of points [n, 3] from their mean."""
+def spread_m(points: Array) -> float:
+    """Root of the mean squared distance of points from their mean, meters.
+
+    Args:
+        points: [n, 3], meters, in any frame.
+    """
     return float(np.sqrt(np.sum(np.var(points, axis=0)))) if len(points) else 0.0
 
 
