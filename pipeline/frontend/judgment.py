@@ -4,8 +4,9 @@ The joint optimization finds the poses that explain the images best, starting fr
 it ends in a wrong minimum, and its residuals look as usual. Matched features and free space are other evidence: they
 took no part in it. A pair is contradicted if features that agree on one motion are far from where the poses have them,
 or if one view stands in space that the other saw to be free. Features may be of something that moves with the camera,
-which depth does not show: where others agree with the poses, images must support the motion of those that do not. What
-contradicted pairs cut off from the largest part of the path is not where the poses have it.
+which depth does not show: where others agree with the poses, images must support the motion of those that do not. And
+poses that features confirm may follow something that moves (`followed_things`). What contradicted pairs cut off from
+the largest part of the path is not where the poses have it.
 """
 
 from __future__ import annotations
@@ -23,12 +24,19 @@ from duagc.pipeline.base.disjoint_sets import join, root_of
 from duagc.pipeline.config.frontend import FrontendConfig, JudgmentConfig
 from duagc.pipeline.frontend.bundle import Images, KeyframeView
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
+from duagc.pipeline.frontend.followed_things import (
+    NO_WITNESSES,
+    Ends,
+    WeakerFeatures,
+    Witnesses,
+    much_of_them,
+    spreads_much_wider,
+)
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid, register
 from duagc.pipeline.registration.feature_judgment import FeatureJudgment, judge_motion
-
-Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
 
 
 class PairVerdict(Enum):
@@ -38,11 +46,12 @@ class PairVerdict(Enum):
     OPEN = "open"
     FEATURES = "features"
     DEPTH = "depth"
+    MOVED = "moved"
 
     @property
     def contradicts(self) -> bool:
         """Whether the motion cannot be true."""
-        return self in (PairVerdict.FEATURES, PairVerdict.DEPTH)
+        return self in (PairVerdict.FEATURES, PairVerdict.DEPTH, PairVerdict.MOVED)
 
 
 @dataclass(frozen=True)
@@ -54,12 +63,34 @@ class Judgment:
         parts: of every keyframe, the part of the path that it is connected with, by its lowest keyframe.
         by_features: the motions that features agree on, of the pairs that they contradict.
         contradicted: the keyframes whose poses were rejected, each with the reason.
+        following: keyframes from which something that moves was followed, to the next one, or from the last one on.
     """
 
     verdicts: Mapping[Ends, PairVerdict]
     parts: Sequence[int]
     by_features: Sequence[RelativePose]
     contradicted: Mapping[int, Reason]
+    following: frozenset[int] = frozenset()
+
+    @property
+    def believes_all(self) -> bool:
+        """Whether no pose is doubted."""
+        return not self.contradicted and not self.following
+
+    @property
+    def may_be_corrected(self) -> bool:
+        """Whether something else than what moves contradicts: of that, another optimization follows the same."""
+        return any(of.contradicts and of is not PairVerdict.MOVED for of in self.verdicts.values())
+
+    def follows(self, frame: TrackedFrame, keyframe: TrackedKeyframe) -> bool:
+        """Whether a frame may have followed something that moves, away from its keyframe.
+
+        Args:
+            frame: as it was tracked.
+            keyframe: to which it is anchored.
+        """
+        anchored = frame.frame_index != keyframe.frame_index and frame.status is not Status.LOST
+        return anchored and frame.keyframe_index in self.following
 
     def corrected(self, pairs: Sequence[RelativePose]) -> list[RelativePose]:
         """Pairs that may be true, and what features say instead of the others.
@@ -94,6 +125,7 @@ def judge(
     images: Images,
     seed: int,
     robot: str,
+    witnesses: Witnesses = NO_WITNESSES,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
     part: str = "judgment",
 ) -> Judgment:
@@ -107,42 +139,85 @@ def judge(
         images: reads the images of a keyframe.
         seed: of the random stream.
         robot: of the random stream.
+        witnesses: frames between the keyframes, asked where keyframes do not tell what moves.
         checkpoints: of the stage.
         part: its name there.
     """
-    verdicts: dict[Ends, PairVerdict] = {}
-    by_features: list[RelativePose] = []
+    found: dict[Ends, _Finding] = {}
+    weaker = WeakerFeatures(views, images, config, witnesses)
     pairs = _judged(len(views), factors, config.keyframes.judgment)
     done = 0
     if (saved := checkpoints.resume(part)) is not None:
-        done, (verdicts, by_features) = saved
+        done, found = saved
     for count, ends in enumerate(pairs[done:], done + 1):
         first, second = ends
         T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
         rng = random_streams.generator(seed, "frontend.judgment", robot=robot, first=first, second=second)
-        limits = config.keyframes.judgment
-        found = judge_motion(
-            views[first].features, views[second].features, T_first_second, config=limits, rng=rng
-        )
-        contradicted = found is not None and contradicts(found, limits)
-        if found is not None and contradicted and found.with_given >= limits.min_inliers:
-            pyramid = images(second, len(views[first].reference.levels))
-            registration = config.tracking.registration
-            if not _images_support(found, views[first], pyramid, registration, T_given=T_first_second):
-                found = None
-        if found is None:
-            verdicts[ends] = _by_depth(views[first].coarsest, views[second].coarsest, T_first_second, config)
-        elif contradicted:
-            verdicts[ends] = PairVerdict.FEATURES
-            by_features.append(RelativePose(first, second, found.T_first_second, found.information))
-        else:
-            verdicts[ends] = PairVerdict.CONFIRMED
-        checkpoints.at(part, count, len(pairs), lambda: (verdicts, by_features))
+        finding = _judged_pair(ends, views, T_first_second, config, images=images, rng=rng)
+        if not finding.verdict.contradicts:
+            follows, place = weaker.follows_thing(ends, T_first_second, rng)
+            finding = _Finding(PairVerdict.MOVED, place) if follows else finding
+        found[ends] = finding
+        checkpoints.at(part, count, len(pairs), lambda: found)
+    verdicts = {ends: finding.verdict for ends, finding in found.items()}
+    by_features = [
+        RelativePose(*ends, finding.T_first_second, finding.information)
+        for ends, finding in found.items()
+        if finding.T_first_second is not None and finding.information is not None
+    ]
+    places = {
+        ends: finding.T_first_second
+        for ends, finding in found.items()
+        if finding.verdict is PairVerdict.MOVED
+    }
+    if places:
+        others = [ends for ends, verdict in verdicts.items() if not verdict.contradicts]
+        also = much_of_them(places, others, T_map_keyframes, views, config.keyframes.judgment)
+        verdicts |= dict.fromkeys(also, PairVerdict.MOVED)
     parts = _parts(len(views), verdicts)
     sizes = {part: parts.count(part) for part in set(parts)}
     main = max(sizes, key=lambda part: (sizes[part], -part))
     rejected = {k: _reason(k, verdicts) for k, part in enumerate(parts) if part != main}
-    return Judgment(verdicts, parts, by_features, rejected)
+    rng = random_streams.generator(seed, "frontend.judgment.last", robot=robot)
+    following = _following(len(views) - 1, verdicts, weaker, rng)
+    return Judgment(verdicts, parts, by_features, rejected, following)
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """What is said of one pair, with the motion that features show instead; information of those that are corrected."""
+
+    verdict: PairVerdict
+    T_first_second: Array | None = None
+    information: Array | None = None
+
+
+def _judged_pair(
+    ends: Ends,
+    views: Sequence[KeyframeView],
+    T_first_second: Array,
+    config: FrontendConfig,
+    *,
+    images: Images,
+    rng: np.random.Generator,
+) -> _Finding:
+    """What the features that are kept of two keyframes say of a motion between them, or depth where they do not."""
+    limits, (first, second) = config.keyframes.judgment, (views[k] for k in ends)
+    found = judge_motion(first.features, second.features, T_first_second, config=limits, rng=rng)
+    contradicted = found is not None and contradicts(found, limits)
+    if found is not None and contradicted and found.with_given >= limits.min_inliers:
+        pyramid = images(ends[1], len(first.reference.levels))
+        registration = config.tracking.registration
+        if not _images_support(found, first, pyramid, registration, T_given=T_first_second):
+            motions = T_first_second, found.T_first_second
+            if spreads_much_wider(first.features, second.features, motions, limits):
+                return _Finding(PairVerdict.MOVED, found.T_first_second)
+            found = None
+    if found is None:
+        return _Finding(_by_depth(first.coarsest, second.coarsest, T_first_second, config))
+    if contradicted:
+        return _Finding(PairVerdict.FEATURES, found.T_first_second, found.information)
+    return _Finding(PairVerdict.CONFIRMED)
 
 
 def _judged(count: int, factors: Sequence[RelativePose], config: JudgmentConfig) -> list[Ends]:
@@ -227,8 +302,19 @@ def _parts(count: int, verdicts: Mapping[Ends, PairVerdict]) -> list[int]:
     return [part(k) for k in range(count)]
 
 
+def _following(
+    last: int, verdicts: Mapping[Ends, PairVerdict], weaker: WeakerFeatures, rng: np.random.Generator
+) -> frozenset[int]:
+    """Keyframes from which something that moves was followed, to the next one, or from the last one on."""
+    moved = {first for first in range(last) if verdicts[first, first + 1] is PairVerdict.MOVED}
+    ends = last - 1 in moved or weaker.witnessed(last, rng)
+    return frozenset(moved | ({last} if ends else set()))
+
+
 def _reason(keyframe: int, verdicts: Mapping[Ends, PairVerdict]) -> Reason:
-    """Whether features or depth contradict a keyframe's pose, or that of the part that it belongs to."""
+    """What contradicts a keyframe's pose, or that of the part that it belongs to."""
     against = [verdict for ends, verdict in verdicts.items() if keyframe in ends and verdict.contradicts]
+    if PairVerdict.MOVED in against:
+        return Reason.SOMETHING_MOVED
     by_depth = against.count(PairVerdict.DEPTH) > against.count(PairVerdict.FEATURES)
     return Reason.CONTRADICTED_BY_DEPTH if by_depth else Reason.CONTRADICTED_BY_FEATURES

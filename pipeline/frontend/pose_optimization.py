@@ -7,7 +7,7 @@ lost here, and what is contradicted as a whole may go on by itself (`rejected_pa
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend import bundle, loops
 from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.followed_things import Witnesses
 from duagc.pipeline.frontend.judgment import Judgment, judge
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pose_graph
 from duagc.pipeline.frontend.loop_outliers import consistent_loops
@@ -103,20 +104,21 @@ class PathOptimization:
         """Optimized poses that nothing contradicts."""
         solution, factors = self._optimized(keyframes, pairs, 1)
         path = OptimizedPath(list(keyframes), list(frames), solution, factors)
-        if not self.config.keyframes.judgment.enabled or len(keyframes) < 2:
+        if not self.config.keyframes.judgment.enabled or not keyframes:
             return path
         judgment = self._judged(path, 1)
-        if not judgment.contradicted:
+        if judgment.believes_all:
             return path
-        pairs = judgment.corrected(pairs)
-        solution, factors = self._optimized(keyframes, pairs, 2)
-        path = replace(path, solution=solution, factors=factors)
-        judgment = self._judged(path, 2)
-        if not judgment.contradicted:
-            return path
+        if judgment.may_be_corrected:
+            pairs = judgment.corrected(pairs)
+            solution, factors = self._optimized(keyframes, pairs, 2)
+            path = replace(path, solution=solution, factors=factors)
+            judgment = self._judged(path, 2)
+            if judgment.believes_all:
+                return path
         pairs = judgment.corrected(pairs)
         rejected = _rejected(path, pairs, judgment)
-        path, pairs = _without_rejected(path, pairs, judgment.contradicted)
+        path, pairs = _without_rejected(path, pairs, judgment)
         solution, factors = self._optimized(path.keyframes, pairs, 3)
         return replace(path, solution=solution, factors=factors, rejected=rejected)
 
@@ -132,6 +134,7 @@ class PathOptimization:
                 images=lambda index, levels: self.images(path.keyframes[index].frame_index, levels),
                 seed=self.seed,
                 robot=self.robot,
+                witnesses=Witnesses(path.frames, self.images),
                 checkpoints=self.checkpoints,
                 part=part,
             )
@@ -200,15 +203,17 @@ def _rejected(path: OptimizedPath, pairs: Sequence[RelativePose], judgment: Judg
             sorted(part),
             path.solution.T_map_keyframe[sorted(part)],
             [pair for pair in pairs if pair.i in part and pair.j in part],
+            judgment.following.intersection(part),
         )
         for _, part in sorted(members.items())
     ]
 
 
 def _without_rejected(
-    path: OptimizedPath, pairs: Sequence[RelativePose], contradicted: Mapping[int, Reason]
+    path: OptimizedPath, pairs: Sequence[RelativePose], judgment: Judgment
 ) -> tuple[OptimizedPath, list[RelativePose]]:
     """The path and its pairs without some keyframes; it starts from where it was optimized."""
+    contradicted = judgment.contradicted
     left = [k for k in range(len(path.keyframes)) if k not in contradicted]
     new = {before: k for k, before in enumerate(left)}
     keyframes = []
@@ -226,6 +231,8 @@ def _without_rejected(
     frames: list[TrackedFrame] = []
     anchor, T_anchor_camera = 0, np.eye(4)
     for frame in path.frames:
+        if judgment.follows(frame, path.keyframes[frame.keyframe_index]):
+            frame = lost(frame, Reason.SOMETHING_MOVED)
         if frame.keyframe_index in new:
             anchor, T_anchor_camera = new[frame.keyframe_index], frame.T_keyframe_camera
         elif frame.status is not Status.LOST:

@@ -13,7 +13,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import SubmapConfig
 from duagc.pipeline.frontend.components import Component, whole
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.submaps import TrackedLog, TrackedSubmap
+from duagc.pipeline.frontend.submaps import TrackedLog, TrackedSubmap, lost
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 
@@ -26,11 +26,13 @@ class RejectedPart:
         keyframes: their numbers in the path, ascending.
         T_map_keyframe: [n, 4, 4], where the optimization had them.
         pairs: registrations between them, by their numbers in the path.
+        following: those from which something that moves was followed to the next one: other frames are lost.
     """
 
     keyframes: Sequence[int]
     T_map_keyframe: Array
     pairs: Sequence[RelativePose]
+    following: frozenset[int] = frozenset()
 
     @property
     def index_of(self) -> dict[int, int]:
@@ -106,12 +108,19 @@ def separated(
             for at, frame in enumerate(frames)
             if (anchor := (submap_of[at], frame.keyframe_index)) in index_of and index_of[anchor] in new
         }
-        posed = sum(frames[at].status is not Status.LOST for at in anchored)
+        unsure = {component.keyframes[k].frame_index: new[k] for k in part.following}
+        own_frames = {
+            at: lost(frames[at], Reason.SOMETHING_MOVED)
+            if keyframe in unsure.values() and frames[at].frame_index not in unsure
+            else frames[at]
+            for at, keyframe in anchored.items()
+        }
+        posed = sum(frame.status is not Status.LOST for frame in own_frames.values())
         if posed < config.min_frames or len(new) < config.min_keyframes:
             continue
         submap = part.submap(max(s.number for s in submaps) + 1, component.keyframes)
         for at, keyframe in anchored.items():
-            frames[at] = replace(frames[at], keyframe_index=keyframe)
+            frames[at] = replace(own_frames[at], keyframe_index=keyframe)
             submap_of[at] = submap.number
         submaps.append(submap)
         others.append(whole(submap))
