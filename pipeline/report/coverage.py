@@ -35,7 +35,7 @@ REASONS = {
     "obstructed": "something is in front of the camera, or it is elsewhere",
     "contradiction": "depth and color contradict each other",
     "unconfirmed": "not recognized, or not yet confirmed",
-    "something_moved": "something moved while the camera was lost",
+    "something_moved": "the pose would follow something that moves",
     "contradicted_by_features": "matched features contradict the pose",
     "contradicted_by_depth": "depth contradicts the pose",
     "other_component": "in a component of its own",
