@@ -36,6 +36,8 @@ class AlignmentSettings:
         depth_gate_m: absolute gate of depth.
         depth_gate_relative: the same as a share of the depth.
         gate_sigmas: the same in sigmas of measured depth.
+        chance_inverse: by how much inverse depths of one surface differ at most by their noise, 1/m: what is off by
+            less, but does not agree, is not judged.
         behind_squared: square of the cosine between ray and normal beyond which a surface is seen from behind.
         min_normal_cosine: of the angle between normals, where those of the target are given.
         sigma_base_m: of the noise of depth.
@@ -56,6 +58,7 @@ class AlignmentSettings:
     depth_gate_m: float
     depth_gate_relative: float
     gate_sigmas: float
+    chance_inverse: float
     behind_squared: float
     min_normal_cosine: float
     sigma_base_m: float

@@ -60,9 +60,10 @@ class Registration:
         information: [6, 6], inverse covariance of its right tangent (translation m, rotation rad); zero if nothing
             was measured.
         outcome: how it ended.
-        overlap: fraction of the samples that the target sees on the same surface, of those whose place it measured.
+        overlap: fraction of the samples that the target sees on the same surface, of those whose place it measured well
+            enough to tell.
         view: fraction of the samples inside the target image.
-        conflict: fraction of the samples, of those whose place it measured, in space that it saw to be free.
+        conflict: fraction of the samples, of those too, in space that it saw to be free.
         rms_depth_m: weighted depth residual, meters.
         rms_gray: weighted gray residual.
         exposure: (gain, offset) with target gray = gain * reference gray + offset.

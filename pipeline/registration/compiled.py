@@ -15,7 +15,7 @@ from duagc.pipeline.kernels import alignment
 from duagc.pipeline.registration.normal_equations import NormalEquations, SamplesSeen, System
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference, ReferenceLevel
-from duagc.pipeline.registration.residuals import GATE_SIGMAS, MAD_FROM, MAD_STRIDE
+from duagc.pipeline.registration.residuals import GATE_SIGMAS, MAD_FROM, MAD_STRIDE, chance_between
 from duagc.pipeline.registration.search import (
     ALL_DIRECTIONS,
     STEP_TOLERANCE,
@@ -51,7 +51,7 @@ def linearize_at(
     samples = reference.levels[index]
     level = _level_arrays(samples, pyramid.levels[index], config)
     numbers = alignment.align_at(
-        level, index, T_reference_target, exposure, settings=_settings(reference, config), isa=isa
+        level, index, T_reference_target, exposure, settings=_settings(reference, pyramid, config), isa=isa
     )
     return _system(numbers, len(samples))
 
@@ -91,7 +91,9 @@ def minimize(
         projection=None if projection is ALL_DIRECTIONS else projection,
         weights_by_correlation=config.weights_by_correlation,
     )
-    T, exposure, numbers, _ = alignment.align(levels, guess, _settings(reference, config), search, isa=isa)
+    T, exposure, numbers, _ = alignment.align(
+        levels, guess, _settings(reference, pyramid, config), search, isa=isa
+    )
     system = _system(numbers, len(reference.levels[0]))
     return T, exposure, system.by_correlation() if config.weights_by_correlation else system
 
@@ -111,7 +113,9 @@ def _level_arrays(samples: ReferenceLevel, level: Level, config: RegistrationCon
     )
 
 
-def _settings(reference: Reference, config: RegistrationConfig) -> alignment.AlignmentSettings:
+def _settings(
+    reference: Reference, pyramid: RgbdPyramid, config: RegistrationConfig
+) -> alignment.AlignmentSettings:
     return alignment.AlignmentSettings(
         use_depth=config.residuals != "gray",
         use_gray=config.residuals != "depth",
@@ -119,6 +123,7 @@ def _settings(reference: Reference, config: RegistrationConfig) -> alignment.Ali
         depth_gate_m=config.depth_gate_m,
         depth_gate_relative=config.depth_gate_relative,
         gate_sigmas=GATE_SIGMAS,
+        chance_inverse=chance_between(reference, pyramid),
         behind_squared=BEHIND_COSINE**2,
         min_normal_cosine=float(np.cos(config.normal_gate_rad)),
         sigma_base_m=config.depth_sigma_base_m,

@@ -127,6 +127,11 @@ class RgbdPyramid:
 
     levels: tuple[Level, ...]
 
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the inverse depth of what is far, in the coarsest image, 1/m."""
+        return self.levels[-1].noise
+
     def without_depth(self) -> RgbdPyramid:
         """The gray values alone, of a frame without a depth image."""
         return self._changed(

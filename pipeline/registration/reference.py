@@ -56,9 +56,11 @@ class Reference:
 
     Attributes:
         levels: one entry per pyramid level, the finest first.
+        noise: standard deviation of the inverse depth of what is far, 1/m; None: not known.
     """
 
     levels: tuple[ReferenceLevel, ...]
+    noise: float | None = None
 
     @property
     def contrast(self) -> float:
@@ -81,7 +83,7 @@ class Reference:
             normals = level.normals_at(rows, columns).reshape(-1, 3)
             known = np.flatnonzero(normals[:, 2])
             levels.append(_samples(level, v[known], u[known], normals[known]))
-        return Reference(tuple(levels))
+        return Reference(tuple(levels), pyramid.noise)
 
     @staticmethod
     def sample(pyramid: RgbdPyramid, count: int = 2000) -> Reference:
@@ -111,7 +113,7 @@ class Reference:
             scale = 2.0**index
             gray = bilinear(level.gray, (u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5)
             levels.append(ReferenceLevel(samples.points, samples.normals, gray, samples.depth_sigmas))
-        return Reference(tuple(levels))
+        return Reference(tuple(levels), pyramid.noise)
 
 
 def _has_normal(level: Level) -> NDArray[np.bool_]:

@@ -29,6 +29,7 @@ from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.depth_noise import DepthNoise
+from duagc.pipeline.geometry.inverse_depth import chance_difference
 from duagc.pipeline.geometry.projection import from_behind
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma, median
 from duagc.pipeline.kernels.alignment import TILE_COLUMNS, TILE_ROWS
@@ -158,14 +159,17 @@ def linearize_at(
             gate = np.maximum(gate, np.float32(GATE_SIGMAS) * measured_sigma[0])
         off = z - q[2]
         agree = np.abs(off) < gate
+        # what noise alone may explain says nothing
+        by_chance = np.float32(chance_between(reference, pyramid)) * z * q[2]
+        decided = agree | ~(np.abs(off) < by_chance)
         # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden
-        free = off >= gate
+        free = decided & (off >= gate)
     m = _rotated(T_target_reference, samples.normals.take(seen, axis=0).T)
     agree &= ~from_behind(q.T, m.T)
     if config.normal_gate_rad > 0:
         agree &= _normals_agree(level, u, v, m, limit_rad=config.normal_gate_rad)
     agreeing = np.flatnonzero(agree)
-    conflicts, judged = int(free.sum()), int(np.isfinite(z).sum())
+    conflicts, judged = int(free.sum()), int((decided & np.isfinite(z)).sum())
     total = len(samples) - (len(seen) - judged)
 
     q, m = q.take(agreeing, axis=1), m.take(agreeing, axis=1)
@@ -212,6 +216,17 @@ def linearize_at(
             sigma_mean_m=float(sigma.mean(dtype=np.float64)) if len(z) else 0.0,
         ),
     )
+
+
+def chance_between(reference: Reference, pyramid: RgbdPyramid) -> float:
+    """By how much inverse depths of one surface differ at most by their noise in two views, 1/m.
+
+    Args:
+        reference: of one view; of unknown noise: that of the other one counts for both.
+        pyramid: of the other view.
+    """
+    noise = pyramid.noise
+    return chance_difference(noise, noise if reference.noise is None else reference.noise)
 
 
 def _rotated(T: Floats, vectors: Floats) -> Floats:

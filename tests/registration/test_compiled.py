@@ -38,12 +38,20 @@ def view(T_world_camera, seed: int, **options) -> RgbdPyramid:
     return RgbdPyramid.build(gray, depth, CAMERA, **options)
 
 
+def off_by_a_tenth(T_world_camera, seed: int) -> RgbdPyramid:
+    """A view whose depth is as wrong as that of what a stereo camera sees far away."""
+    gray, depth = render(T_world_camera)
+    noise = 0.04 * np.random.default_rng(seed).standard_normal(depth.shape)
+    return RgbdPyramid.build(gray, (1 / (1 / depth + noise)).astype(np.float32), CAMERA)
+
+
 SIGMA = np.random.default_rng(3).uniform(0.002, 0.08, (CAMERA.height, CAMERA.width)).astype(np.float32)
 MASK = np.random.default_rng(4).random((CAMERA.height, CAMERA.width)) > 0.01
 TARGETS = {
     "plain": view(END, 2),
     "sigma": view(END, 2, depth_sigma_m=SIGMA),
     "masked": view(END, 2, mask=MASK),
+    "far": off_by_a_tenth(END, 2),
     "without depth": view(END, 2, mask=MASK).without_depth(),
     "nothing": RgbdPyramid.build(*np.zeros((2, CAMERA.height, CAMERA.width), np.float32), CAMERA),
 }
@@ -86,8 +94,17 @@ def test_normal_equations_are_those_of_the_residuals(reference, target, settings
             assert found.seen.sigma_mean_m == pytest.approx(wanted.seen.sigma_mean_m, rel=1e-12)
             for name in ("overlap", "view", "conflict", "agreeing", "median_depth_m"):
                 assert getattr(found.seen, name) == getattr(wanted.seen, name), name
-    no_normals = target == "without depth" and settings == "all gates"
+    no_normals = target in ("without depth", "far") and settings == "all gates"
     assert (found.seen.agreeing == 0) == (target == "nothing" or no_normals)
+
+
+def test_what_noise_may_explain_is_no_conflict(reference):
+    at = TARGETS["far"], 0, T_START_END
+    for samples in (reference, replace(reference, noise=None)):  # of unknown noise: that of the other view
+        seen = compiled.linearize_at(samples, *at, exposure=EXPOSURE, config=RegistrationConfig()).seen
+        assert seen.conflict < 0.05
+        assert seen.overlap > 0.9 * seen.view
+        assert seen.agreeing < 0.8 * seen.view * len(samples.levels[0])  # the others are not judged
 
 
 def test_images_of_a_few_pixels_show_nothing(reference):

@@ -30,7 +30,7 @@ struct TargetImages {
 
 struct AlignmentSettings {
     bool use_depth, use_gray, gray_noise_of_depth;
-    float depth_gate_m, depth_gate_relative, gate_sigmas, behind_squared, min_normal_cosine;
+    float depth_gate_m, depth_gate_relative, gate_sigmas, chance_inverse, behind_squared, min_normal_cosine;
     float sigma_base_m, sigma_quadratic_per_m, sigma_nearest_m;
     double depth_scale_floor, gray_scale_floor, gray_floor_of_depth, huber_sigmas;
     float min_gradient;

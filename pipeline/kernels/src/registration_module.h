@@ -28,8 +28,8 @@ private:
 static AlignmentSettings alignment_settings(const Array<const double>& values) {
     const double* v = values.data();
     const auto f = [&](int k) { return static_cast<float>(v[k]); };
-    return {v[0] != 0.0, v[1] != 0.0, v[2] != 0.0, f(3),  f(4),  f(5),  f(6),  f(7),  f(8), f(9),
-            f(10),       v[11],       v[12],       v[13], v[14], f(15), static_cast<size_t>(v[16]), static_cast<size_t>(v[17])};
+    return {v[0] != 0.0, v[1] != 0.0, v[2] != 0.0, f(3),  f(4),  f(5),  f(6),  f(7),  f(8), f(9), f(10),
+            f(11),       v[12],       v[13],       v[14], v[15], f(16), static_cast<size_t>(v[17]), static_cast<size_t>(v[18])};
 }
 
 static void write_normal_equations(const NormalEquations& part, bool statistics, double* out) {

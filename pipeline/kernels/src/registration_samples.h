@@ -128,17 +128,20 @@ NO_INLINE static void judge(const TargetImages& image, const AlignmentSettings& 
     else
         std::memcpy(b->z, b->qz, sizeof b->z);
     const float gate_m = settings.depth_gate_m, gate_relative = settings.depth_gate_relative;
-    const float gate_sigmas = image.depth_sigma ? settings.gate_sigmas : 0.0f;
+    const float gate_sigmas = image.depth_sigma ? settings.gate_sigmas : 0.0f, chance = settings.chance_inverse;
     for (int i = 0; i < count; i++) {
         const float tl = b->depth[0][2 * i], tr = b->depth[0][2 * i + 1], bl = b->depth[1][2 * i], br = b->depth[1][2 * i + 1];
         const float least = smaller(smaller(tl, tr), smaller(bl, br));
         const float q = b->qz[i], z = b->z[i];
         const float relative = gate_relative * q, wide = gate_sigmas * b->noise[i];
         const float gate = gate_m > relative ? gate_m : relative, limit = gate > wide ? gate : wide;
-        const float off = z - q;
+        const float off = z - q, by_chance = chance * z * q;
         const int32_t known = b->flags[i] & (least > 0.0f ? IN_VIEW : 0);  // 1 or 0
-        const int32_t judged = known & (__builtin_fabsf(z) <= __FLT_MAX__ ? 1 : 0);
-        const int32_t agrees = known & (__builtin_fabsf(off) < limit ? 1 : 0), conflicts = known & (off >= limit ? 1 : 0);
+        const int32_t agrees = known & (__builtin_fabsf(off) < limit ? 1 : 0);
+        // what noise alone may explain says nothing
+        const int32_t decided = agrees | (__builtin_fabsf(off) < by_chance ? 0 : 1);
+        const int32_t judged = known & decided & (__builtin_fabsf(z) <= __FLT_MAX__ ? 1 : 0);
+        const int32_t conflicts = known & decided & (off >= limit ? 1 : 0);
         b->flags[i] += judged * JUDGED + agrees * (AGREES + HAS_GRAY) + conflicts * CONFLICTS;
     }
 }
