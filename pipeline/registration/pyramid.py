@@ -21,6 +21,7 @@ from duagc.pipeline.geometry.inverse_depth import inverse_depth_sigma
 from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
 from duagc.pipeline.geometry.scattered_holes import without_scattered_holes
 from duagc.pipeline.kernels import pyramid as compiled
+from duagc.pipeline.registration.wide_surfaces import WideSurfaces
 
 Image = NDArray[Any]
 
@@ -131,6 +132,13 @@ class RgbdPyramid:
     def noise(self) -> float:
         """Standard deviation of the inverse depth of what is far, in the coarsest image, 1/m."""
         return self.levels[-1].noise
+
+    @cached_property
+    def wide_surfaces(self) -> WideSurfaces | None:
+        """Surfaces where noise of depth hides them from the windows of `Level.normals`; None: nowhere."""
+        finest, coarsest = self.levels[0], self.levels[-1]
+        factor = 1 << (len(self.levels) - 1)
+        return WideSurfaces.of(finest.inverse_depth, coarsest.inverse_depth, factor, self.noise)
 
     def without_depth(self) -> RgbdPyramid:
         """The gray values alone, of a frame without a depth image."""

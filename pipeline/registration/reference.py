@@ -77,12 +77,12 @@ class Reference:
             strides: pixels between samples, finest level first.
         """
         levels = []
-        for level, stride in zip(pyramid.levels, strides, strict=True):
+        for index, (level, stride) in enumerate(zip(pyramid.levels, strides, strict=True)):
             rows, columns = sampled_grid(level.camera.width, level.camera.height, stride)
             v, u = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
-            normals = level.normals_at(rows, columns).reshape(-1, 3)
-            known = np.flatnonzero(normals[:, 2])
-            levels.append(_samples(level, v[known], u[known], normals[known]))
+            surfaces = _Surfaces.at(pyramid, index, (rows, columns), level.normals_at(rows, columns))
+            known = np.flatnonzero(surfaces.normals[..., 2])
+            levels.append(_samples(level, v[known], u[known], surfaces.chosen(known)))
         return Reference(tuple(levels), pyramid.noise)
 
     @staticmethod
@@ -100,14 +100,16 @@ class Reference:
         """
         finest = pyramid.levels[0]
         gu, gv = finest.gradients
-        known = _has_normal(finest) & _usable_at_all_levels(pyramid)
+        whole = np.arange(finest.camera.height), np.arange(finest.camera.width)
+        surfaces = _Surfaces.at(pyramid, 0, whole, finest.normals)
+        known = _has_normal(surfaces.normals) & _usable_at_all_levels(pyramid)
         strength = np.where(known, np.sqrt(gu * gu + gv * gv), np.float32(-1))
         textured = round(count * GRADIENT_SHARE)
         chosen = np.union1d(
             _strongest_of_tiles(strength, textured), _centers_of_tiles(known, count - textured)
         )
         v, u = np.divmod(chosen, finest.camera.width)
-        samples = _samples(finest, v, u, finest.normals[v, u])
+        samples = _samples(finest, v, u, surfaces.chosen(chosen))
         levels = [samples]
         for index, level in enumerate(pyramid.levels[1:], start=1):
             scale = 2.0**index
@@ -116,9 +118,40 @@ class Reference:
         return Reference(tuple(levels), pyramid.noise)
 
 
-def _has_normal(level: Level) -> NDArray[np.bool_]:
-    """Pixels [h, w] off the border whose normal is known."""
-    known = level.normals[..., 2] != 0
+@dataclass(frozen=True)
+class _Surfaces:
+    """What is seen at the pixels of a grid.
+
+    Attributes:
+        normals: [r, c, 3], or [n, 3] of chosen ones; zero where unknown.
+        inverse_depth: [r, c], or [n], 1/m.
+    """
+
+    normals: Samples
+    inverse_depth: Samples
+
+    @staticmethod
+    def at(
+        pyramid: RgbdPyramid, index: int, pixels: tuple[NDArray[np.intp], NDArray[np.intp]], normals: Samples
+    ) -> _Surfaces:
+        """At rows and columns, with normals by the level, or by wide windows where noise hides surfaces from it."""
+        level, wide = pyramid.levels[index], pyramid.wide_surfaces
+        inverse_depth = level.inverse_depth[np.ix_(*pixels)]
+        if wide is not None:
+            factor = 1 << (len(pyramid.levels) - 1 - index)
+            normals, inverse_depth = wide.instead(
+                normals, inverse_depth, pixels=pixels, camera=level.camera, factor=factor
+            )
+        return _Surfaces(normals, inverse_depth)
+
+    def chosen(self, index: NDArray[np.intp]) -> _Surfaces:
+        """Those of flat indices [n]."""
+        return _Surfaces(self.normals.reshape(-1, 3)[index], self.inverse_depth.ravel()[index])
+
+
+def _has_normal(normals: Samples) -> NDArray[np.bool_]:
+    """Pixels [h, w] off the border whose normal, of [h, w, 3], is known."""
+    known = normals[..., 2] != 0
     known[:MARGIN] = known[-MARGIN:] = False
     known[:, :MARGIN] = known[:, -MARGIN:] = False
     return known
@@ -136,12 +169,12 @@ def _usable_at_all_levels(pyramid: RgbdPyramid) -> NDArray[np.bool_]:
     return usable
 
 
-def _samples(level: Level, v: NDArray[np.int64], u: NDArray[np.int64], normals: Samples) -> ReferenceLevel:
-    """The samples at pixels (u, v), each [n], of known depth and normals [n, 3]."""
-    camera, z = level.camera, 1 / level.inverse_depth[v, u].astype(np.float64)
+def _samples(level: Level, v: NDArray[np.int64], u: NDArray[np.int64], surfaces: _Surfaces) -> ReferenceLevel:
+    """The samples at pixels (u, v), each [n], of the surfaces there."""
+    camera, z = level.camera, 1 / surfaces.inverse_depth.astype(np.float64)
     points = back_project(camera, u, v, z)
     sigmas = None if level.depth_sigma_m is None else level.depth_sigma_m[v, u]
-    return ReferenceLevel(points.astype(np.float32), normals, level.gray[v, u], sigmas)
+    return ReferenceLevel(points.astype(np.float32), surfaces.normals, level.gray[v, u], sigmas)
 
 
 def _tiles(image: Samples, count: int) -> tuple[Samples, int, NDArray[np.int64]]:
