@@ -8,6 +8,7 @@ COMPILED = ("duagc.pipeline.kernels._raster", "duagc.converters.simulate.render.
 """Modules that a source tree lacks before they are built."""
 ROOM = ", expected room for the output"
 FILES = ", expected more files to be open at the same time (ulimit -n)"
+DISK = ", expected a file that can be read to its end: its disk or network is broken"
 MEMORY = ", expected more memory (ulimit -v), or fewer --workers"
 PROCESSES = ", expected more processes and threads (ulimit -u), or fewer --workers"
 LIMITS = {
@@ -16,6 +17,7 @@ LIMITS = {
     errno.EFBIG: ROOM,
     errno.EMFILE: FILES,  # of this process, of the machine
     errno.ENFILE: FILES,
+    errno.EIO: DISK,
     errno.ENOMEM: MEMORY,
     errno.EAGAIN: PROCESSES,
 }

@@ -33,6 +33,7 @@ def opencv_error(code: int) -> cv2.error:
     ("error", "found", "expected"),
     [
         (os_error(errno.EMFILE), "Too many open files", "ulimit -n"),
+        (os_error(errno.EIO), "Input/output error", "can be read to its end"),
         (os_error(errno.ENFILE), "Too many open files in system", "ulimit -n"),
         (os_error(errno.ENOMEM), "Cannot allocate memory", "ulimit -v"),
         (os_error(errno.EAGAIN), "Resource temporarily unavailable", "ulimit -u"),
