@@ -89,7 +89,7 @@ def nanoseconds(text: str, where: str) -> int:
         where: begins the line of an error.
 
     Raises:
-        DuagError: it is no number, or a time after 2115.
+        DuagError: it is no number, or a time after 2115 or before 1824.
     """
     try:
         time_ns = nanoseconds_of(text)
@@ -99,7 +99,8 @@ def nanoseconds(text: str, where: str) -> int:
         time_ns = LAST_NS
     if abs(time_ns) < LAST_NS:
         return time_ns
-    raise DuagError(f"{where}: {text[:60]!r}, expected a time in seconds before the year 2116")
+    sound = "after the year 1823" if time_ns < 0 else "before the year 2116"
+    raise DuagError(f"{where}: {text[:60]!r}, expected a time in seconds {sound}")
 
 
 def read_list(path: Path) -> list[Listed]:

@@ -126,6 +126,7 @@ NAMED = [
     ("scannetpp", nested, "transforms_undistorted.json: not valid JSON"),
     ("tum", of_open_loris, "rgb.txt: No such file, but color.txt, groundtruth.txt; expected rgb.txt and depth.txt"),
     ("tum", added("rgb.txt", "1e999999 rgb/y.png\n"), "rgb.txt:10: '1e999999', expected a time in seconds before"),
+    ("tum", added("rgb.txt", "-8694968547.95 rgb/y.png\n"), "expected a time in seconds after the year 1823"),
     ("tum", added("groundtruth.txt", "1e8 1e300 0 0 0 0 0 1\n"), "groundtruth.txt:35: is 1e+300 m away"),
 ]  # fmt: skip
 
