@@ -129,16 +129,16 @@ class RgbdPyramid:
     levels: tuple[Level, ...]
 
     @property
-    def noise(self) -> float:
+    def inverse_depth_sigma(self) -> float:
         """Standard deviation of the inverse depth of what is far, in the coarsest image, 1/m."""
-        return self.levels[-1].noise
+        return self.levels[-1].inverse_depth_sigma
 
     @cached_property
     def wide_surfaces(self) -> WideSurfaces | None:
         """Surfaces where noise of depth hides them from the windows of `Level.normals`; None: nowhere."""
         finest, coarsest = self.levels[0], self.levels[-1]
         factor = 1 << (len(self.levels) - 1)
-        return WideSurfaces.of(finest.inverse_depth, coarsest.inverse_depth, factor, self.noise)
+        return WideSurfaces.of(finest.inverse_depth, coarsest.inverse_depth, factor, self.inverse_depth_sigma)
 
     def without_depth(self) -> RgbdPyramid:
         """The gray values alone, of a frame without a depth image."""

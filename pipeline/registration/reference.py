@@ -56,11 +56,11 @@ class Reference:
 
     Attributes:
         levels: one entry per pyramid level, the finest first.
-        noise: standard deviation of the inverse depth of what is far, 1/m; None: not known.
+        inverse_depth_sigma: standard deviation of the inverse depth of what is far, 1/m; None: not known.
     """
 
     levels: tuple[ReferenceLevel, ...]
-    noise: float | None = None
+    inverse_depth_sigma: float | None = None
 
     @property
     def contrast(self) -> float:
@@ -83,7 +83,7 @@ class Reference:
             surfaces = _Surfaces.at(pyramid, index, (rows, columns), level.normals_at(rows, columns))
             known = np.flatnonzero(surfaces.normals[..., 2])
             levels.append(_samples(level, v[known], u[known], surfaces.chosen(known)))
-        return Reference(tuple(levels), pyramid.noise)
+        return Reference(tuple(levels), pyramid.inverse_depth_sigma)
 
     @staticmethod
     def sample(pyramid: RgbdPyramid, count: int = 2000) -> Reference:
@@ -115,7 +115,7 @@ class Reference:
             scale = 2.0**index
             gray = bilinear(level.gray, (u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5)
             levels.append(ReferenceLevel(samples.points, samples.normals, gray, samples.depth_sigmas))
-        return Reference(tuple(levels), pyramid.noise)
+        return Reference(tuple(levels), pyramid.inverse_depth_sigma)
 
 
 @dataclass(frozen=True)

@@ -225,8 +225,8 @@ def chance_between(reference: Reference, pyramid: RgbdPyramid) -> float:
         reference: of one view; of unknown noise: that of the other one counts for both.
         pyramid: of the other view.
     """
-    noise = pyramid.noise
-    return chance_difference(noise, noise if reference.noise is None else reference.noise)
+    sigma, other = pyramid.inverse_depth_sigma, reference.inverse_depth_sigma
+    return chance_difference(sigma, sigma if other is None else other)
 
 
 def _rotated(T: Floats, vectors: Floats) -> Floats:

@@ -45,20 +45,20 @@ class WideSurfaces:
     chance: float
 
     @staticmethod
-    def of(finest: Image, coarsest: Image, factor: int, noise: float) -> WideSurfaces | None:
+    def of(finest: Image, coarsest: Image, factor: int, sigma: float) -> WideSurfaces | None:
         """Of a view; None: noise hides nothing.
 
         Args:
             finest: inverse depth [h, w], 1/m, 0 = unknown.
             coarsest: the same of the coarsest image, [h // factor, w // factor].
             factor: between their sizes.
-            noise: standard deviation of the inverse depth in the coarsest image, 1/m.
+            sigma: standard deviation of the inverse depth in the coarsest image, 1/m.
         """
-        chance = chance_difference(noise, noise)
+        chance = chance_difference(sigma, sigma)
         below = chance / TELLS_STEPS
         if not np.any((coarsest > 0) & (coarsest < below)):
             return None
-        planes = _planes(_means_of_blocks(finest, coarsest, factor, chance), chance, CHANCE_SIGMAS * noise)
+        planes = _planes(_means_of_blocks(finest, coarsest, factor, chance), chance, CHANCE_SIGMAS * sigma)
         return WideSurfaces(planes, below, chance)
 
     def instead(

@@ -100,7 +100,10 @@ def test_normal_equations_are_those_of_the_residuals(reference, target, settings
 
 def test_what_noise_may_explain_is_no_conflict(reference):
     at = TARGETS["far"], 0, T_START_END
-    for samples in (reference, replace(reference, noise=None)):  # of unknown noise: that of the other view
+    for samples in (
+        reference,
+        replace(reference, inverse_depth_sigma=None),
+    ):  # of unknown noise: that of the other view
         seen = compiled.linearize_at(samples, *at, exposure=EXPOSURE, config=RegistrationConfig()).seen
         assert seen.conflict < 0.05
         assert seen.overlap > 0.9 * seen.view
