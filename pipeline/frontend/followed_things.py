@@ -27,13 +27,14 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.registration.bearing_judgment import bearings_contradict
 from duagc.pipeline.registration.bearing_motion import BearingMatches
+from duagc.pipeline.registration.descriptors import matches
 from duagc.pipeline.registration.feature_motion import (
     agreeing,
     matched_features,
     motion_spread_wider,
     spread_m,
 )
-from duagc.pipeline.registration.features import Features, extract_from_pyramid, matches
+from duagc.pipeline.registration.features import Features, extract_from_pyramid
 
 NARROW = 0.75
 """Spread of features, in that of the points of a view, below which weaker ones are asked."""
@@ -195,6 +196,7 @@ def much_of_them(
     places: Mapping[Ends, Array | None],
     pairs: Collection[Ends],
     T_map_keyframes: Array,
+    *,
     views: Sequence[KeyframeView],
     config: JudgmentConfig,
 ) -> set[Ends]:

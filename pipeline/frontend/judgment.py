@@ -172,7 +172,7 @@ def judge(
     }
     if places:
         others = [ends for ends, verdict in verdicts.items() if not verdict.contradicts]
-        also = much_of_them(places, others, T_map_keyframes, views, config.keyframes.judgment)
+        also = much_of_them(places, others, T_map_keyframes, views=views, config=config.keyframes.judgment)
         verdicts |= dict.fromkeys(also, PairVerdict.MOVED)
     parts = _parts(len(views), verdicts)
     sizes = {part: parts.count(part) for part in set(parts)}

@@ -119,7 +119,7 @@ def test_what_one_pair_knows_to_move_holds_in_others(run: Undisturbed, scene) ->
     for shown, follows in ((slice(0, 60), True), (slice(60, 100), False)):
         of_third = features(of_second.points[shown], descriptors[shown])
         views = [replace(k, features=f) for k, f in zip(base, (of_first, of_second, of_third), strict=True)]
-        found = much_of_them({(0, 1): T}, [(1, 2)], still, views, limits)
+        found = much_of_them({(0, 1): T}, [(1, 2)], still, views=views, config=limits)
         assert found == ({(1, 2)} if follows else set())
 
 
