@@ -7,6 +7,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Callable
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -271,9 +272,8 @@ def database(path: Path, rng: np.random.Generator) -> bool:
     data = path.read_bytes()
     replace(path, data)
     try:
-        with sqlite3.connect(path) as base:
+        with closing(sqlite3.connect(path)) as base, base:
             base.execute(STATEMENTS[int(rng.integers(len(STATEMENTS)))])
-        base.close()
     except sqlite3.Error:
         return False
     return True
@@ -283,11 +283,10 @@ def database_rows(path: Path, rng: np.random.Generator) -> bool:
     """One message of a ROS 2 bag."""
     replace(path, path.read_bytes())
     try:
-        with sqlite3.connect(path) as base:
+        with closing(sqlite3.connect(path)) as base, base:
             rows = base.execute("select id, data from messages").fetchall()
             row, data = rows[int(rng.integers(len(rows)))]
             base.execute("update messages set data = ? where id = ?", (content(data, rng), row))
-        base.close()
     except (sqlite3.Error, TypeError, ValueError):
         return False
     return True

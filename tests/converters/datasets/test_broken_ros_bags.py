@@ -6,6 +6,7 @@ import json
 import re
 import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -109,9 +110,8 @@ def edit_metadata(bag: Path, pattern: str, new: str) -> None:
 
 
 def edit_rows(bag: Path, statement: str) -> None:
-    with sqlite3.connect(next(bag.glob("*.db3"))) as base:
+    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as base, base:
         base.execute(statement)
-    base.close()
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.7, 0.95])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +125,7 @@ def together(r: Ros, rows: list[Row], form: str) -> list[Row]:
 
 def without_definitions(folder: Path) -> None:
     """Make a bag of ROS 2 one of Humble, which holds no definitions."""
-    with sqlite3.connect(next(folder.glob("*.db3"))) as database:
+    with closing(sqlite3.connect(next(folder.glob("*.db3")))) as database, database:
         database.execute("DROP TABLE message_definitions")
         database.execute("UPDATE schema SET schema_version = 3, ros_distro = 'humble'")
 
@@ -225,7 +226,7 @@ def test_a_message_that_cannot_be_read_says_why(tmp_path: Path) -> None:
     r = Ros(2)
     log = r.write(tmp_path / "log", together(r, scene(r), "realsense"), "sqlite3")
     without_definitions(log)
-    with sqlite3.connect(next(log.glob("*.db3"))) as database:
+    with closing(sqlite3.connect(next(log.glob("*.db3")))) as database, database:
         database.execute("UPDATE messages SET data = X'00010000' WHERE length(data) > 20000")
     with pytest.raises(
         DuagError, match=r"found no topic of images.*; .*/camera/rgbd holds 4 bytes that are no "
