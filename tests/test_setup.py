@@ -1,6 +1,7 @@
 """`make setup`: an environment without pip is made anew; libraries have the versions of the golden runs."""
 
 import json
+import re
 import shutil
 import subprocess
 import tomllib
@@ -8,13 +9,12 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
 
 from duagc.pipeline.manifest import LIBRARIES
 
 ROOT = Path(__file__).parents[1]
 PINNED = [
-    Requirement(line)
+    line.split("==")
     for line in (ROOT / "constraints.txt").read_text().splitlines()
     if line and not line.startswith("#")
 ]
@@ -49,13 +49,11 @@ def test_an_environment_without_pip_is_made_anew(tmp_path: Path) -> None:
     assert "Python 3.9 found, Python 3.11 or later expected" in done.stderr
 
 
-@pytest.mark.parametrize("pinned", PINNED, ids=lambda pinned: pinned.name)
-def test_pinned_versions_are_allowed_and_installed(pinned: Requirement) -> None:
+@pytest.mark.parametrize(("name", "version"), PINNED)
+def test_pinned_versions_are_installed_and_those_of_the_project(name: str, version: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    allowed = next(r for r in map(Requirement, project["dependencies"]) if r.name == pinned.name)
-    found = metadata.version(pinned.name)
-    assert found in pinned.specifier
-    assert found in allowed.specifier
+    assert any(re.match(rf"{name}[><=;, ]", dependency) for dependency in project["dependencies"])
+    assert metadata.version(name) == version
 
 
 @pytest.mark.parametrize(
@@ -64,6 +62,6 @@ def test_pinned_versions_are_allowed_and_installed(pinned: Requirement) -> None:
 def test_golden_runs_were_made_with_the_pinned_versions(path: Path) -> None:
     libraries = json.loads(path.read_text())["libraries"]
     assert set(libraries) == set(LIBRARIES)
-    pinned = [requirement for requirement in PINNED if requirement.name in libraries]
+    pinned = {name: version for name, version in PINNED if name in libraries}
     assert len(pinned) == 3
-    assert all(libraries[requirement.name] in requirement.specifier for requirement in pinned)
+    assert libraries.items() >= pinned.items()
