@@ -90,7 +90,10 @@ class CurveKind:
         """What the metadata of a log say of it."""
         if self.degree == DEGREE and self.gyro is None:
             return {}
-        gyro = self.gyro and {key: getattr(self.gyro, key).tolist() for key in ("R_camera_gyro", "bias")}
+        gyro = None
+        if self.gyro is not None:
+            R, bias = self.gyro.R_camera_gyro, self.gyro.bias_rad_s
+            gyro = {"R_camera_gyro": R.tolist(), "bias": bias.tolist()}
         return {KIND_KEY: json.dumps({"degree": self.degree, "gyro": gyro})}
 
 
