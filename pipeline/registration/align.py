@@ -173,9 +173,10 @@ def linearize(
     system = compiled.linearize_at(reference, pyramid, level, T, exposure=start, config=config)
     if config.weights_by_correlation and level == 0:
         system = system.by_correlation()
-    at_minimum = system.moved(search.step(system, T, T, None, projection=ALL_DIRECTIONS))
-    found = _Determined.by(at_minimum, config)  # away from it gradients tell of the distance as well
-    step = search.step(system, T, T, None, projection=found.projection)
+    step = search.step(system, T, T, None, projection=ALL_DIRECTIONS)
+    found = _Determined.by(system.moved(step), config)  # away from it gradients tell of the distance as well
+    if found.projection is not ALL_DIRECTIONS:
+        step = search.step(system, T, T, None, projection=found.projection)
     T_minimum, exposure_minimum = T @ se3.exp(step[:6]), start + step[6:]
     return _judge(
         system,
