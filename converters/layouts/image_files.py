@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from duagc.converters.layouts.ros_images import encoded_size
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import decode_image, read_bytes
-from duagc.pipeline.config.base import Config, expected_of
+from duagc.pipeline.config.base import NO_NUMBER, Config, booleans_for_numbers, expected_of, short
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.recording.greatest_depth import without_saturated
 
@@ -35,6 +35,8 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
     Raises:
         DuagError: names a wrong one.
     """
+    for name in booleans_for_numbers(model, values):
+        raise DuagError(f"{dataset}: {name} {NO_NUMBER}")
     try:
         return model(**values)
     except ValidationError as error:
@@ -45,7 +47,7 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
             raise DuagError(f"{dataset}: {name} is no option; {hint}") from error
         if not first["loc"]:  # of several options together
             raise DuagError(f"{dataset}: {first['ctx']['error']}") from error
-        raise DuagError(f"{dataset}: {name} = {first['input']!r}: {expected_of(first)}") from error
+        raise DuagError(f"{dataset}: {name} = {short(repr(first['input']))}: {expected_of(first)}") from error
 
 
 def add_numbered(found: dict[int, Path], number: int, path: Path) -> None:

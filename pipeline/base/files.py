@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LARGEST_BYTES = 1 << 29
+MOST_OF_LINE = 80  # characters of a line that a message repeats
+TOO_LONG = "it holds a number of more than 4300 digits"  # of ValueErrors that tomllib does not raise itself
 
 
 def check_file(path: Path, expected: str, largest: int | None = None) -> int:
@@ -74,7 +77,7 @@ def read_text(path: Path, expected: str) -> str:
     try:
         return read_bytes(path, expected).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DuagError(f"{path}: is not text, expected {expected}") from error
+        raise DuagError(f"{path}: is not text in UTF-8, expected {expected}") from error
 
 
 def read_toml(path: Path, expected: str) -> dict[str, Any]:
@@ -105,8 +108,24 @@ def parse_toml(text: str, path: Path, expected: str) -> dict[str, Any]:
 
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # a number of more than 4300 digits is a plain ValueError
-        raise DuagError(f"{path}: not valid TOML: {error}, expected {expected}") from error
+    except (ValueError, RecursionError) as error:
+        why = _reason_and_line(error, text)
+        raise DuagError(f"{path}: not valid TOML: {why}, expected {expected}") from error
+
+
+def _reason_and_line(error: Exception, text: str) -> str:
+    """Why a text is no TOML, and the line; the parser names neither a key that comes twice nor a limit of Python."""
+    import tomllib
+
+    if isinstance(error, RecursionError):
+        return "it is nested too deep"
+    if not isinstance(error, tomllib.TOMLDecodeError):
+        return TOO_LONG
+    place, lines = re.search(r"\(at line (\d+), ", str(error)), text.splitlines() or [""]
+    number = len(lines) if place is None else min(int(place[1]), len(lines))  # none: "at end of document"
+    line = lines[number - 1].strip()
+    why = str(error).replace("Cannot overwrite a value", "a key comes twice, or is a value and a section", 1)
+    return f"{why}: {line[:MOST_OF_LINE]}"
 
 
 def read_json(path: Path, expected: str) -> dict[str, Any]:

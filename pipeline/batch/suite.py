@@ -13,7 +13,14 @@ from pydantic import ValidationError
 
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_toml
-from duagc.pipeline.config.base import Config, expected_of, load_config
+from duagc.pipeline.config.base import (
+    NO_NUMBER,
+    Config,
+    booleans_for_numbers,
+    expected_of,
+    load_config,
+    short,
+)
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.run_plan import LAST, NAMES
 
@@ -108,6 +115,8 @@ def read_suite(path: Path) -> Suite:
         DuagError: it is no suite, or names what does not exist.
     """
     values = read_toml(path, "a suite")
+    for name in booleans_for_numbers(SuiteFile, values):
+        raise DuagError(f"{path}: {name} {NO_NUMBER}")
     try:
         file = SuiteFile.model_validate(values)
     except ValidationError as error:
@@ -121,7 +130,9 @@ def read_suite(path: Path) -> Suite:
     if not file.seeds or len(set(file.seeds)) != len(file.seeds):
         raise DuagError(f"{path}: seeds are {list(file.seeds)}, expected different ones, at least one")
     if file.until not in NAMES:
-        raise DuagError(f"{path}: until {file.until}: is no stage, {closest(file.until, NAMES, 'a stage')}")
+        raise DuagError(
+            f"{path}: until {short(file.until)}: is no stage, {closest(file.until, NAMES, 'a stage')}"
+        )
     _check_exclusions(path, file)
     cells = {cell.name: cell for cell in _cells(path, file)}
     if not cells:
@@ -133,7 +144,7 @@ def _complaint(error: ValidationError) -> str:
     first = error.errors()[0]
     *section, name = map(str, first["loc"])
     if first["type"] != "extra_forbidden":
-        found = "" if first["type"] == "missing" else f" = {first['input']!r}"
+        found = "" if first["type"] == "missing" else f" = {short(repr(first['input']))}"
         return f"{'.'.join([*section, name])}{found}: {expected_of(first)}"
     models: dict[str, type[Config]] = {"configurations": SuiteConfiguration, "exclude": Exclusion}
     model = models[section[0]] if section else SuiteFile

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from duagc.pipeline.base.errors import DuagError, closest
-from duagc.pipeline.base.files import read_toml
+from duagc.pipeline.base.files import TOO_LONG, read_toml
 
 
 class Config(BaseModel):
@@ -64,6 +64,8 @@ def _documented(module: str) -> dict[str, dict[str, str]]:
     return found
 
 
+NO_NUMBER = "is true or false, expected a number"
+
 LARGEST = 2**62
 """Of numbers; as nanoseconds 146 years."""
 
@@ -76,7 +78,8 @@ EXPECTED = {
 """What is said of a wrong value in place of pydantic's words, by the type of its error."""
 
 MOST_SAID = 100
-"""Characters of an override that a message repeats."""
+"""Characters of an override, a name or a value that a message repeats."""
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 Model = TypeVar("Model", bound=Config)
 
@@ -98,8 +101,8 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
         values = read_toml(Path(path), "a TOML configuration")
     for override in overrides:
         _apply(values, override)
-    for name in _booleans_for_numbers(model, values):
-        raise DuagError(f"{_said_where(name, source, overrides)}: {name} is true or false, expected a number")
+    for name in booleans_for_numbers(model, values):
+        raise DuagError(f"{_said_where(name, source, overrides)}: {name} {NO_NUMBER}")
     try:
         config = model.model_validate(values)
         check_numbers(config, source, overrides)
@@ -107,16 +110,16 @@ def load_config(model: type[Model], path: str | Path | None = None, overrides: S
     except ValidationError as error:
         found = error.errors()
         first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])
-        name = ".".join(str(part) for part in first["loc"])
-        source = _said_where(name, source, overrides)
+        path_of = [str(part) for part in first["loc"]]
+        source, name = _said_where(".".join(path_of), source, overrides), _written(path_of)
         if first["type"] == "extra_forbidden":
-            nearest = _nearest(model, [str(part) for part in first["loc"]])
+            nearest = _nearest(model, path_of)
             raise DuagError(
                 f"{source}: {name} is not a known setting, {nearest}; see {model.LISTED}"
             ) from error
         if first["type"] == "value_error":
             raise DuagError(f"{source}: {first['ctx']['error']}") from error
-        value = "is missing," if first["type"] == "missing" else f"= {first['input']!r}:"
+        value = "is missing," if first["type"] == "missing" else f"= {short(repr(first['input']))}:"
         raise DuagError(f"{source}: {name} {value} {expected_of(first)}") from error
 
 
@@ -136,19 +139,42 @@ def _said_where(name: str, source: str, overrides: Sequence[str]) -> str:
     for override in reversed(overrides):
         said = f"{override.partition('=')[0].strip()}."
         if said.startswith(f"{name}.") or f"{name}.".startswith(said):
-            return f"--set {override if len(override) <= MOST_SAID else override[:MOST_SAID] + ' ...'}"
+            return f"--set {short(override)}"
     return source
 
 
-def _booleans_for_numbers(model: type[Config], values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Names of numbers for which true or false was said; pydantic would take them as 1 and 0."""
+def short(text: str) -> str:
+    """A text as a message repeats it: no more of it than finds it again.
+
+    Args:
+        text: a name, a value or an override.
+    """
+    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]} ..."
+
+
+def _written(path: Sequence[str]) -> str:
+    """A dotted name as TOML has it: a part that is empty or holds a dot or a blank stands in quotes."""
+    return short(".".join(part if _BARE_KEY.fullmatch(part) else f'"{part}"' for part in path))
+
+
+def booleans_for_numbers(model: type[Config], values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Names of numbers for which true or false was said; pydantic would take them as 1 and 0.
+
+    Args:
+        model: the settings.
+        values: of these, by name, as they were read.
+        prefix: of their names.
+    """
     for name, value in values.items():
         kind = field.annotation if (field := model.model_fields.get(name)) else None
         if isinstance(value, Mapping) and isinstance(kind, type) and issubclass(kind, Config):
-            yield from _booleans_for_numbers(kind, value, f"{prefix}{name}.")
+            yield from booleans_for_numbers(kind, value, f"{prefix}{name}.")
         kinds = get_args(kind) or (kind,)
-        if isinstance(value, bool) and bool not in kinds and not {int, float}.isdisjoint(kinds):
-            yield f"{prefix}{name}"
+        if bool not in kinds and not {int, float}.isdisjoint(kinds):
+            some = enumerate(value) if isinstance(value, list) else [(None, value)]
+            for place, one in some:
+                if isinstance(one, bool):
+                    yield f"{prefix}{name}" + ("" if place is None else f".{place}")
 
 
 def check_numbers(config: Config, source: str, overrides: Sequence[str] = (), prefix: str = "") -> None:
@@ -268,7 +294,7 @@ def value_of(text: str, where: str) -> Any:
     except RecursionError as error:
         raise DuagError(f"{where}: is nested too deep, expected a value") from error
     except ValueError as error:
-        raise DuagError(f"{where}: {error}, expected a value") from error
+        raise DuagError(f"{where}: {TOO_LONG}, expected a value") from error
 
 
 def dump_config(config: Config) -> str:

@@ -20,7 +20,7 @@ def test_a_byte_order_mark_is_no_text(mark: bytes, tmp_path: Path) -> None:
 def test_what_is_no_text_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "list.txt"
     path.write_bytes(b"\xff\xfe1\0")
-    with pytest.raises(DuagError, match=r"list\.txt: is not text, expected a list"):
+    with pytest.raises(DuagError, match=r"list\.txt: is not text in UTF-8, expected a list"):
         read_text(path, "a list")
 
 

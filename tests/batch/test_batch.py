@@ -90,6 +90,7 @@ def test_a_matrix_has_every_cell_with_its_settings(suite: Suite) -> None:
     ("old", "new", "complaint"),
     [
         ("wall = ", 'other = "nowhere"\nwall = ', "nowhere/recording.json: no such file"),
+        ("[0, 1]", "[0, true]", r"toml: seeds\.1 is true or false, expected a number"),
         (
             "loss_probability",
             "loss_probabilty",

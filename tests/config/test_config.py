@@ -154,7 +154,7 @@ def test_overrides_win_over_the_file(tmp_path: Path) -> None:
         ("link={loss_probability = false}", "link.loss_probability is true or false, expected a number"),
         pytest.param("seed=" + 400 * "9", "seed is 1.00000e+400, expected at most 4.61169e+18", id="large"),
         pytest.param("seed=-" + 400 * "9", "seed is -1.00000e+400, expected 0 or more", id="small"),
-        pytest.param("seed=" + 5000 * "9", "value has 5000 digits", id="long"),
+        pytest.param("seed=" + 5000 * "9", "holds a number of more than 4300 digits", id="long"),
     ],
 )
 def test_errors_name_the_setting(override: str, expected: str) -> None:
@@ -201,6 +201,45 @@ def test_a_file_that_is_wrong_is_said_in_words_of_its_settings(tmp_path: Path, t
     with pytest.raises(DuagError) as caught:
         load_config(RunConfig, path)
     assert str(caught.value).startswith(f"{path}: {said}")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "[exchange.verification.gicp]\ndistances_m = [0.1, true]",
+            "distances_m.1 is true or false, expected",
+        ),
+        ('"exchange.link.loss_probability" = 0.3', '"exchange.link.loss_probability" is not a known setting'),
+        ('[exchange]\n"" = 1', 'exchange."" is not a known setting'),
+        (
+            "seed = 1\nseed = 2\n",
+            "a key comes twice, or is a value and a section (at line 2, column 9): seed = 2",
+        ),
+        (
+            "seed = 1\nseed = 2",
+            "a key comes twice, or is a value and a section (at end of document): seed = 2",
+        ),
+        ("seed: 1", "(at line 1, column 5): seed: 1, expected a TOML configuration"),
+    ],
+)
+def test_an_odd_file_is_said_with_the_key_or_the_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    with pytest.raises(DuagError) as caught:
+        load_config(RunConfig, path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("text", [f"{5000 * 'x'} = 1", f"seed = '{5000 * 'x'}'"], ids=["key", "value"])
+def test_a_message_repeats_no_more_of_a_text_than_finds_it_again(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    with pytest.raises(DuagError) as caught:
+        load_config(RunConfig, path)
+    assert "xxx" in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 300
 
 
 def names(model: type[Config], prefix: str = "") -> Iterator[str]:

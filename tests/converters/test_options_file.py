@@ -124,3 +124,24 @@ def test_datasets_are_listed_without_docstrings(monkeypatch: pytest.MonkeyPatch)
     """As `python -OO` leaves them."""
     monkeypatch.setattr(seven_scenes, "__doc__", None)
     assert "7scenes: \n    --set frame_limit=0" in registry.describe()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "max_difference_s = true",
+            "options.toml, for ros: max_difference_s is true or false, expected a number",
+        ),
+        (
+            f"time_source = '{'x' * 5000}'",
+            r"options.toml, for ros: time_source = 'x+ \.\.\.: expected 'header'",
+        ),
+    ],
+)
+def test_a_wrong_option_is_said_in_a_short_line(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "options.toml").write_text(text)
+    with pytest.raises(DuagError, match=said) as caught:
+        registry.convert("ros", tmp_path, tmp_path / "rec", options_file=tmp_path / "options.toml")
+    assert len(str(caught.value)) < len(str(tmp_path)) + 300
+    assert not (tmp_path / "rec").exists()
