@@ -88,7 +88,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         recording.warnings += _world_warnings(robot_logs)
         settle_clocks(recording, robot_logs)
         for part in sources:
-            write_robot(recording, part.robot, robot_logs[part.robot], part.label)
+            write_robot(recording, part.robot, robot_logs[part.robot], part.part)
 
 
 def _robot_log(log: Log, part: Source, sources: Sequence[Source]) -> RobotLog:
@@ -168,7 +168,7 @@ def write_robot(
         recording: gets the logs.
         name: of the robot.
         source: its log.
-        label: which part of the source it was.
+        label: which part of the source it was; kept in the log, whose digest it changes.
         max_ratio: largest residual of the self-check, as a share of the depth.
         gap: frames between those that the self-check compares.
     """

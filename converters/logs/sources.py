@@ -64,6 +64,12 @@ class Source:
         """How messages call it: the log, or the folder of several."""
         return str(self.paths[0] if len(self.paths) == 1 else self.paths[0].parent)
 
+    @property
+    def part(self) -> str:
+        """What the robot's log says of where it is from: its namespace. Names of files are no content: logs that were
+        renamed are the same logs, and what is made of them has the same digest."""
+        return self.namespace if self.namespace == self.label else ""
+
 
 def sources_of(src: Path, options: Mapping[str, Any]) -> list[Source]:
     """Logs, namespace and settings of every robot, in order of its name.

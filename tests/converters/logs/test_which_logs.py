@@ -15,12 +15,28 @@ from duagc.converters.logs.describe import describe
 from duagc.converters.logs.sources import sources_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import info
+from duagc.pipeline.runs.digest import digest
 from tests.fixtures.ros_bags import START_NS, Ros, scene, still
 from tests.fixtures.ros_clocks import moved_headers
 
 
 def later(r: Ros, rows: list[Any], by_ns: int) -> list[Any]:
     return [(topic, at + by_ns, message) for topic, at, message in moved_headers(r, rows, by_ns)]
+
+
+def test_logs_that_were_renamed_make_the_same_recording(tmp_path: Path) -> None:
+    r = Ros(1)
+    bag = r.write(tmp_path / "bag", still(r), "plain")
+    digests = []
+    for folder, names in (("first", ("a", "b")), ("second", ("morning", "noon"))):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            shutil.copy(bag, tmp_path / folder / f"{name}.bag")
+        registry.convert("ros", tmp_path / folder, tmp_path / "made" / folder)
+        digests.append(digest(tmp_path / "made" / folder))
+        parts = json.loads((tmp_path / "made" / folder / "recording.json").read_text())["source"]["parts"]
+        assert parts == [f"{name}.bag" for name in names]
+    assert digests[0] == digests[1]
 
 
 def test_our_own_recordings_and_runs_are_no_robots(tmp_path: Path) -> None:
