@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from duagc.pipeline.recording.moved_depth import depth_delay_ns, move_depth, tra
 from duagc.pipeline.recording.pairing import pair, pair_topics
 from duagc.pipeline.recording.read import LOG_RECORD, LogFile
 from duagc.pipeline.recording.rgbd_frame import RgbdFrame
-from duagc.pipeline.recording.rolling_shutter import Readout, Unrolling, unrollings
+from duagc.pipeline.recording.rolling_shutter import Readout, SeenPoints, Unrolling, unrollings
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.schemas import topics as topic_table
 
@@ -55,9 +55,8 @@ class RgbdLog:
     """Color and depth of one robot: a frame is a color image and the depth nearest to it in time.
 
     Where no depth is near enough a frame has none; `pairing` has all times. Depth of another time is as it was taken
-    until `move_depth` says how the camera moved. Depth may be registered already, or of another
-    camera, or a LiDAR's (`depth_sources`). Masks belong to the color image of the same publish time; `valid` belongs
-    to all of them.
+    until `move_depth` says how the camera moved. Depth may be registered already, or of another camera, or a LiDAR's
+    (`depth_sources`). Masks belong to the color image of the same publish time; `valid` belongs to all of them.
 
     `robot`, `camera`, `lens` (with which its images were taken; None = by the camera), `depth_scale` (meters per unit),
     `valid` (bool [H, W], pixels that show the scene; None = all), `depth_delay_ns` (of `delay_depth`), `readout` (how
@@ -108,6 +107,7 @@ class RgbdLog:
         self.stated_shutter_s = stated_shutter_s(written, str(self.path))
         self._motion: DepthMotion | None = None
         self._kind: CurveKind | None = None
+        self._points = dict[tuple[int, int], SeenPoints]()  # of `moved_rows_px`, by delay and index
         self.shutter: OpenShutter | None = None
         if not len(self.pairing.offsets_ns):
             near = f"within {self.pairing.tolerance_ns / 1e6:g} ms of each other"
@@ -246,8 +246,7 @@ class RgbdLog:
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Every frame in order of time."""
-        for index in range(len(self)):
-            yield self.frame(index)
+        yield from map(self.frame, range(len(self)))
 
     def frame(self, index: int, *, still: bool = True, depth: bool = True) -> RgbdFrame:
         """Read one frame.
@@ -323,7 +322,8 @@ class RgbdLog:
         """What a frame has besides its color; readout: by which its rows are put into one time."""
         mask = self._mask_of(color_ns)
         read = self._read_depth(depth_ns if with_depth or readout.rolls else None)
-        of_color, of_depth = self._unrollings(color_ns, depth_ns, readout, read)
+        seen = partial(SeenPoints, self.camera, read.depth_m)
+        of_color, of_depth = self._unrollings(color_ns, depth_ns, readout, seen)
         if with_depth:
             depth, moved = self._in_time_of_color(read, color_ns, depth_ns, unrolling=of_depth)
         else:
@@ -353,23 +353,23 @@ class RgbdLog:
         return self._source.read(self._log.record_at(self._source.topic, self._depth_at[depth_ns]))
 
     def moved_rows_px(self, index: int) -> float:
-        """How far the median pixel of a frame, as it was read, lies from where a still camera has it.
+        """How far the median pixel of a frame as read is from where a still camera has it; its depth is read once.
 
         Args:
             index: position in the log, 0 <= index < len(self).
         """
-        times = self._stamps(index)
-        found = self._unrollings(*times, self.readout, self._read_depth(times[1]))
+        key, (color_ns, depth_ns) = (self.depth_delay_ns, index), self._stamps(index)
+        if key not in self._points:
+            self._points[key] = SeenPoints(self.camera, self._read_depth(depth_ns).depth_m)
+        found = self._unrollings(color_ns, depth_ns, self.readout, lambda: self._points[key])
         return max((unrolling.move_px for unrolling in found if unrolling is not None), default=0.0)
 
     def _unrollings(
-        self, color_ns: int, depth_ns: int | None, readout: Readout, depth: DepthImage
+        self, color_ns: int, depth_ns: int | None, readout: Readout, seen: Callable[[], SeenPoints]
     ) -> tuple[Unrolling | None, Unrolling | None]:
         """How color and depth of a frame are made still."""
-        if self._motion is None:
-            return None, None
         times_ns = color_ns, color_ns if depth_ns is None else depth_ns
-        return unrollings(self._motion, self.camera, times_ns, readout, depth_m=depth.depth_m)
+        return unrollings(self._motion, self.camera, times_ns, readout, seen=seen)
 
     def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [H, W] with 0 where the camera never shows the scene."""

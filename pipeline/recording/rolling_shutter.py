@@ -8,7 +8,7 @@ row that saw its point. Where a log states nothing, the front end finds it (`fro
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -279,23 +279,23 @@ class Unrolling:
 
 
 def unrollings(
-    motion: DepthMotion,
+    motion: DepthMotion | None,
     camera: PinholeCamera,
     times_ns: tuple[int, int],
     readout: Readout,
     *,
-    depth_m: Image,
+    seen: Callable[[], SeenPoints],
 ) -> tuple[Unrolling | None, Unrolling | None]:
     """How color and depth of a frame are made still; None where rows are of one time, or nothing says how it moved.
 
     Args:
-        motion: of the camera.
+        motion: of the camera; None: not known.
         camera: of both.
         times_ns: of color and of depth, each in the middle of its readout.
         readout: of both.
-        depth_m: depth [h, w] as it was read, 0 = unknown.
+        seen: gives what the frame shows, by its depth as it was read; asked for only if rows are of other times.
     """
-    if not readout.rolls:
+    if motion is None or not readout.rolls:
         return None, None
     count, by_columns = readout.lines(camera), readout.by_columns
     lines = known_lines(count)
@@ -304,13 +304,13 @@ def unrollings(
     T_color_then = motion.at(times_ns[0], np.concatenate([*times, times_ns]))
     if T_color_then is None:
         return None, None
-    seen, T_color_middle = SeenPoints(camera, depth_m), T_color_then[-2:]
+    points, T_color_middle = seen(), T_color_then[-2:]
     found: list[Unrolling | None] = []
     for T_middle, T_line, readout_s in zip(
         T_color_middle, np.split(T_color_then[:-2], 2), readouts_s, strict=True
     ):
         T_middle_line = all_lines(se3.inverse(T_middle) @ T_line, count)
-        found.append(Unrolling(seen, T_middle_line, by_columns=by_columns) if readout_s else None)
+        found.append(Unrolling(points, T_middle_line, by_columns=by_columns) if readout_s else None)
     return found[0], found[1]
 
 

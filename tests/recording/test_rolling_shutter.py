@@ -12,7 +12,8 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import open_rgbd
-from duagc.pipeline.recording.depth_sources import DepthImage
+from duagc.pipeline.recording.depth_sources import DepthImage, Registered
+from duagc.pipeline.recording.read import Record
 from duagc.pipeline.recording.rolling_shutter import (
     Readout,
     SeenPoints,
@@ -116,24 +117,32 @@ def test_poses_between_those_that_are_computed_are_interpolated() -> None:
         assert np.allclose(all_lines(known, count), every, atol=1e-5)
 
 
-@pytest.mark.parametrize("stated", [True, False])
-def test_frames_of_a_log_are_still_once_its_motion_is_known(tmp_path: Path, stated: bool) -> None:
-    times = np.arange(5) / 30
+TIMES_S = np.arange(5) / 30
+PATH = Trajectory(np.rint(1e9 * TIMES_S).astype(np.int64), poses(TIMES_S))
+
+
+def recorded(folder: Path, stated: bool) -> Path:
+    """A log of rolling images, which states their readout or not."""
     keys = ("rolling_shutter_s", "depth_rolling_shutter_s") if stated else ()
     sensors = dict.fromkeys(keys, str(READOUT_S))
     with (
-        RecordingWriter(tmp_path / "rec") as recording,
+        RecordingWriter(folder) as recording,
         recording.robot("alpha", CAMERA, SCALE_M, sensors, find_regions=False) as robot,
     ):
-        for t in times:
+        for t in TIMES_S:
             color, depth = shot(rows(t))
             units = np.rint(depth / SCALE_M).astype(np.uint16)
             png = cv2.imencode(".png", color[:, :, ::-1])[1].tobytes()
             robot.add_frame(round(1e9 * t), png, "png", units)
-    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+    return folder / "alpha.mcap"
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_frames_of_a_log_are_still_once_its_motion_is_known(tmp_path: Path, stated: bool) -> None:
+    with open_rgbd(recorded(tmp_path / "rec", stated)) as log:
         read = log.frame(2)
         assert log.needs_motion == stated
-        log.move_depth(Trajectory(np.rint(1e9 * times).astype(np.int64), poses(times)))
+        log.move_depth(PATH)
         found = log.frame(2)
         assert np.array_equal(log.usable_depth(2), found.usable_depth)
     if not stated:
@@ -141,6 +150,29 @@ def test_frames_of_a_log_are_still_once_its_motion_is_known(tmp_path: Path, stat
         assert np.array_equal(found.depth, read.depth)
         return
     assert found.mask is not None
-    after = differences(found.color, found.depth, found.mask, times[2])
+    after = differences(found.color, found.depth, found.mask, TIMES_S[2])
     assert after[0] < 4
     assert after[1] < 0.004
+
+
+def test_depth_is_read_once_to_know_how_far_rows_move(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[Record] = []
+    taken = Registered.read
+
+    def noted(source: Registered, record: Record) -> DepthImage:
+        read.append(record)
+        return taken(source, record)
+
+    monkeypatch.setattr(Registered, "read", noted)
+    with open_rgbd(recorded(tmp_path / "rec", stated=True)) as log:
+        log.move_depth(PATH)
+        far_px = log.moved_rows_px(2)
+        log.readout = Readout(0.5 * READOUT_S, 0.5 * READOUT_S)
+        near_px = log.moved_rows_px(2)
+        assert len(read) == 1
+        log.delay_depth(33_333_333)  # now the image has the depth of the next one
+        log.moved_rows_px(2)
+        assert len(read) == 2
+    assert near_px == pytest.approx(0.5 * far_px, rel=0.05)
