@@ -166,7 +166,8 @@ def _steps(middle: Stack) -> Mask:
 def percentiles(depth: Stack) -> Stack:
     """The 10th, 50th and 90th percentile of every pixel, [3, h, w]; NaN where it never had a depth.
 
-    The same bits as by `np.nanpercentile`, which takes pixels one by one: here those with as many depths go together.
+    Those of `np.nanpercentile`, rounded to the type of the depths. That takes pixels one by one; here those with as
+    many depths go together.
 
     Args:
         depth: [n, h, w], NaN where a pixel has none.
