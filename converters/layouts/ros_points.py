@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.ros_images import UnusableImage
@@ -168,16 +169,19 @@ class _Rows:
         self.stamp, self._where = message.header.stamp, where
         self._is_big = bool(message.is_bigendian)
         step, width, height = int(message.point_step), int(message.width), int(message.height)
-        row = int(message.row_step) or step * width
+        used = step * width
+        row = int(message.row_step) or used
+        # the last row may come without its padding
+        size = max(row, used) * (height - 1) + used if height > 0 else 0
         data = np.frombuffer(bytes(message.data), np.uint8)
         missing = [name for name in "xyz" if name not in self.fields]
-        if missing or step < 1 or row < step * width or len(data) < row * height:
-            kind = UnusableSweep if not missing and step > 0 and row >= step * width else DuagError
+        if missing or step < 1 or row < used or len(data) < size:
+            kind = UnusableSweep if not missing and step > 0 and row >= used else DuagError
             raise kind(
                 f"{where} has fields {sorted(self.fields)} and {len(data)} bytes for {width}x{height} points "
-                f"of {step}, expected x, y, z and {max(row, step * width) * height} bytes"
+                f"of {step}, expected x, y, z and {size} bytes"
             )
-        of_points = data[: row * height].reshape(height, row)[:, : step * width]
+        of_points = as_strided(data, (height, used), (row, 1), writeable=False)
         self._bytes, self._step = np.ascontiguousarray(of_points).reshape(-1, step), step
 
     def column(self, name: str) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from duagc.converters.layouts.ros_points import PointTimes, as_of, points_of
+from duagc.converters.layouts.ros_points import PointTimes, UnusableSweep, as_of, points_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording.motion import GyroPrior, OdometryPrior
@@ -49,6 +49,18 @@ def cloud(
         data=data.ravel(),
         header=SimpleNamespace(stamp=SimpleNamespace(sec=1_700_000_000, nanosec=250_000_000)),
     )
+
+
+@pytest.mark.parametrize("height", [1, 2])
+def test_the_last_row_needs_no_padding(height: int) -> None:
+    """So do images come, and sweeps of one row from which a driver took points and left the length of the row."""
+    message = cloud(height=height, pad=64)
+    message.data = message.data[:-64]
+    np.testing.assert_array_equal(points_of(message, "here")[0], POINTS)
+    message.data = message.data[:-1]
+    short = len(message.data)
+    with pytest.raises(UnusableSweep, match=f"{short} bytes .* and {short + 1} bytes"):
+        points_of(message, "here")
 
 
 @pytest.mark.parametrize("names", ["xyz", "zyx"])
