@@ -115,7 +115,14 @@ class Level:
         """
         mask = None if self.mask is None else masks.halved(self.mask)
         gray, inverse_depth, sigma = compiled.halved(self.gray, self.inverse_depth, self.depth_sigma_m, mask)
-        return Level(self.camera.halved(), gray, inverse_depth, depth_sigma_m=sigma, mask=mask)
+        return Level(
+            self.camera.halved(),
+            gray,
+            inverse_depth,
+            has_depth=self.has_depth,
+            depth_sigma_m=sigma,
+            mask=mask,
+        )
 
 
 @dataclass(frozen=True)
