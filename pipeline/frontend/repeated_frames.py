@@ -41,7 +41,7 @@ def without_stuck(frames: Sequence[TrackedFrame], T_map_keyframe: Array) -> list
         since_s = stamps_s[m + 1] - stamps_s[m]
         if (_motion(poses[m], poses[m + 1]) > MOVED + PACE * speed * since_s).any():
             k = placed[m]
-            while frames[k].repeats:
+            while k >= 0 and frames[k].repeats:
                 if frames[k].status is not Status.LOST:
                     out[k] = lost(frames[k], Reason.REPEATED)
                 k -= 1

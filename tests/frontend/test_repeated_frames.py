@@ -39,6 +39,7 @@ def frames_at(places_m: list[float | None], repeats: list[int]) -> list[TrackedF
         ([0.00, 0.02, 0.02, None, None, 0.36, 0.38], [2], [2]),
         ([0.00, 0.02, 0.02, 0.02], [2, 3], []),  # nothing comes after them
         ([0.00, 0.02, 0.02, 0.02, 0.10], [2, 3], [2, 3]),  # nothing says how fast it went
+        ([0.00, 0.00, 0.20, 0.22, 0.22], [0, 1, 4], [0, 1]),  # the first ones, as they are followed backward
     ],
 )
 def test_which_repeated_frames_are_lost(
