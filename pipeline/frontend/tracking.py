@@ -61,9 +61,7 @@ class Tracker:
                 registered to; None: as configured.
         """
         self.camera = camera
-        self.state = TrackingState(config, motion)
-        if max_depth_offset_s is not None:
-            self.state.max_depth_offset_s = max_depth_offset_s
+        self.state = TrackingState(config, motion, max_depth_offset_s=max_depth_offset_s)
         self._relocalizer = Relocalizer()
 
     @property
@@ -322,7 +320,10 @@ class Tracker:
 
     def _is_near(self, depth_offset_ns: int) -> bool:
         """Whether depth was taken so near in time to its color that others may be registered to it."""
-        return abs(depth_offset_ns) * 1e-9 <= self.state.max_depth_offset_s
+        limit_s = self.state.max_depth_offset_s
+        if limit_s is None:
+            limit_s = self.state.config.keyframes.max_depth_offset_s
+        return abs(depth_offset_ns) * 1e-9 <= limit_s
 
     def _is_well_exposed(self, pyramid: RgbdPyramid, result: Registration) -> bool:
         """Whether a frame looks as its keyframe does; or, hardly more saturated, leaves it or drifts from its exposure.

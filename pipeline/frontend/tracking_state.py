@@ -60,7 +60,7 @@ class TrackingState:
         turns: by a gyroscope and by the images, of the last frames that the images determine.
         gyro: what these say of the gyroscope.
         max_depth_offset_s: by which depth may be earlier or later than its color, of a frame that others are
-            registered to.
+            registered to; None: as configured.
         intervals: between frames.
         frozen: detects frozen images.
         occlusion: detects objects in front of the camera.
@@ -85,7 +85,7 @@ class TrackingState:
     followed_m_s: float = 0.0
     turns: list[Turn] = field(default_factory=list)
     gyro: GyroCorrection = field(default_factory=GyroCorrection)
-    max_depth_offset_s: float = field(init=False)
+    max_depth_offset_s: float | None = None
     gray_rms: RecentMedian = field(init=False)
     intervals: FrameIntervals = field(init=False)
     frozen: FrozenImageDetector = field(init=False)
@@ -93,7 +93,6 @@ class TrackingState:
     _prediction: LastPrediction = field(init=False)
 
     def __post_init__(self) -> None:
-        self.max_depth_offset_s = self.config.keyframes.max_depth_offset_s
         self.gray_rms = RecentMedian(self.config.tracking.failure.usual_frames)
         self.intervals = FrameIntervals(self.config.tracking.failure.interval_frames)
         self.frozen = FrozenImageDetector(self.config.tracking.failure)

@@ -226,6 +226,13 @@ def test_depth_of_long_before_makes_no_keyframe() -> None:
     assert len(tracker.keyframes) == 2
 
 
+def test_a_copy_takes_depth_from_as_far_in_time() -> None:
+    far_ns = 50_000_000
+    wide = Tracker(CAMERA, CONFIG, max_depth_offset_s=0.06)
+    for tracker in (wide, wide.copied(), wide.copied(CONFIG.model_copy())):
+        assert tracker.track(0, 0, *render(walk(0)), depth_offset_ns=far_ns).status is Status.OK
+
+
 def test_too_large_a_motion_is_not_called_tracked() -> None:
     tracker = Tracker(CAMERA, CONFIG)
     tracker.track(0, 0, *render(walk(0)))
