@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments.disturbances import Disturbance
 from duagc.pipeline.experiments.shots import Shot
+from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
@@ -57,7 +58,9 @@ def track(tracker: Tracker, shot: Shot) -> tuple[TrackedFrame, NDArray[np.float6
         shot: the frame.
     """
     image = shot.color.astype(np.float32) * np.float32(1 / 255)
-    frame = tracker.track(shot.index, shot.stamp_ns, image, shot.depth)
+    frame = tracker.track(
+        RgbdImages(frame_index=shot.index, stamp_ns=shot.stamp_ns, image=image, depth_m=shot.depth)
+    )
     if not tracker.keyframes:
         return frame, np.eye(4)
     return frame, tracker.keyframes[frame.keyframe_index].T_map_keyframe @ frame.T_keyframe_camera

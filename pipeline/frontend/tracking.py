@@ -13,14 +13,13 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
 from duagc.pipeline.frontend.failure import Reason, saturated_share, saturated_share_of
-from duagc.pipeline.frontend.frame_images import Image, RgbdImages
+from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
 from duagc.pipeline.frontend.keyframe_insertion import insert_first_keyframe, insert_keyframe
 from duagc.pipeline.frontend.missing_images import count_missing_image, follow_by_color, follow_by_depth
@@ -92,44 +91,13 @@ class Tracker:
         other.state, other._relocalizer = self.state.copied(config), copy.copy(self._relocalizer)
         return other
 
-    def track(
-        self,
-        frame_index: int,
-        stamp_ns: int,
-        image: Image,
-        depth_m: Image,
-        *,
-        mask: NDArray[np.bool_] | None = None,
-        depth_sigma_m: Image | None = None,
-        depth_offset_ns: int = 0,
-        depth_moved: bool = False,
-    ) -> TrackedFrame:
+    def track(self, images: RgbdImages) -> TrackedFrame:
         """Track one frame; the first that can be used becomes keyframe 0 and the origin of the map.
 
         Args:
-            frame_index: in the log.
-            stamp_ns: time of the frame, increasing.
-            image: color [h, w, 3] or gray [h, w], 0..1.
-            depth_m: [h, w], meters, 0 = unknown.
-            mask: as of `RgbdImages`.
-            depth_sigma_m: as of `RgbdImages`.
-            depth_offset_ns: how much later the depth was taken.
-            depth_moved: as of `RgbdImages`.
+            images: of the frame; stamps increase.
         """
-        return self.track_frame(
-            self.prepared(
-                RgbdImages(
-                    frame_index=frame_index,
-                    stamp_ns=stamp_ns,
-                    image=image,
-                    depth_m=depth_m,
-                    mask=mask,
-                    depth_sigma_m=depth_sigma_m,
-                    depth_offset_ns=depth_offset_ns,
-                    depth_moved=depth_moved,
-                )
-            )
-        )
+        return self.track_frame(self.prepared(images))
 
     def prepared(self, images: RgbdImages) -> CurrentFrame:
         """A frame with all that tracking needs; the state does not change.

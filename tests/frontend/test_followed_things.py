@@ -29,6 +29,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.registration.features import Bearings, Features
 from tests.fixtures.films import CAMERA, filmed
+from tests.fixtures.frame_images import of_shot
 from tests.frontend.conftest import CONFIG, STARTS
 
 FRAMES = (25, 40)  # 22 mm apart; of one keyframe, and of two
@@ -57,7 +58,7 @@ def with_thing(shots: list[Shot]) -> list[Shot]:
 
 def optimized(shots: list[Shot]) -> tuple[Tracker, OptimizedPath]:
     tracker = Tracker(CAMERA, CONFIG)
-    frames = [tracker.track(s.index, s.stamp_ns, s.color.astype(np.float32) / 255, s.depth) for s in shots]
+    frames = [tracker.track(of_shot(s)) for s in shots]
 
     def images(index: int, levels: int) -> RgbdPyramid:
         return RgbdPyramid.build(

@@ -17,12 +17,12 @@ from duagc.converters.simulate.trajectories.loops import look_at
 from duagc.pipeline.experiments.shots import FRAME_NS, Shot
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.registration import RgbdPyramid
+from tests.fixtures.frame_images import of_shot
 from tests.frontend.conftest import CONFIG
 
 CAMERA = camera_of((320, 240))
@@ -80,8 +80,7 @@ def pyramid(shot: Shot, levels: int) -> RgbdPyramid:
 def tracked(shots: list[Shot]) -> tuple[TrackedLog, list[Component]]:
     tracker = SubmapTracker(CAMERA, CONFIG)
     for s in shots:
-        image = s.color.astype(np.float32) / 255
-        tracker.track(RgbdImages(frame_index=s.index, stamp_ns=s.stamp_ns, image=image, depth_m=s.depth))
+        tracker.track(of_shot(s))
     log = tracker.finish()
     components = join_submaps(
         log.submaps, lambda frame, levels: pyramid(shots[frame], levels), CONFIG, seed=0, robot="alpha"
@@ -112,10 +111,7 @@ def test_once_something_is_known_to_have_moved_no_single_view_tells_the_place() 
     """Later views show the table alone; what was tracked meanwhile is placed by all of its views."""
     shots, _ = recorded((0.0, 0.35))
     tracker = Tracker(CAMERA, CONFIG)
-    frames = [
-        tracker.track(s.index, s.stamp_ns, s.color.astype(np.float32) / 255, s.depth)
-        for s in shots[: FRAMES + COVERED + 10]
-    ]
+    frames = [tracker.track(of_shot(s)) for s in shots[: FRAMES + COVERED + 10]]
     reasons = [frame.reason for frame in frames]
     assert set(reasons[:FRAMES]) == {Reason.NONE}
     first = reasons.index(Reason.SOMETHING_MOVED)

@@ -8,6 +8,7 @@ from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Outcome, Reference, Registration, RgbdPyramid, register
+from tests.fixtures.frame_images import rgbd
 from tests.fixtures.room import CAMERA, detailed, pose
 
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
@@ -48,7 +49,7 @@ def test_a_lamp_on_the_camera_is_followed_through_the_dark(half: float, power: f
     for k in range(24):
         gray, depth_m = shot(k)
         dark = lit(gray, depth_m, half=half, power=power, seed=k)
-        frames.append(tracker.track(k, 33_333_333 * k, dark, depth_m))
+        frames.append(tracker.track(rgbd(k, dark, depth_m)))
     assert [f.status for f in frames] == [Status.OK] * 24
     assert len(tracker.keyframes) >= 3  # partly black, as all images there
     poses = [tracker.keyframes[f.keyframe_index].T_map_keyframe @ f.T_keyframe_camera for f in frames]

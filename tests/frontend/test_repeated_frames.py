@@ -8,6 +8,7 @@ from duagc.pipeline.frontend.repeated_frames import without_stuck
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
+from tests.fixtures.frame_images import rgbd
 from tests.fixtures.room import CAMERA, render
 from tests.frontend.test_frame_times import CONFIG, walk
 
@@ -59,5 +60,5 @@ def test_which_repeated_frames_are_lost(
 def test_the_tracker_says_which_frames_repeat_both_images() -> None:
     tracker = Tracker(CAMERA, CONFIG)
     shown = [0, 1, 2, 2, 2, 3]
-    found = [tracker.track(k, 33_333_333 * k, *render(walk(step))) for k, step in enumerate(shown)]
+    found = [tracker.track(rgbd(k, *render(walk(step)))) for k, step in enumerate(shown)]
     assert [frame.repeats for frame in found] == [False, False, False, True, True, False]

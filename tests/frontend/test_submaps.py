@@ -19,7 +19,6 @@ from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.experiments.shots import Shot
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.stage import component_path, run_frontend
 from duagc.pipeline.frontend.submap_joining import join_submaps
@@ -32,6 +31,7 @@ from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.runs.robot_data import registrations_of
 from duagc.schemas import topics
 from tests.fixtures.films import SMALL, walk_around
+from tests.fixtures.frame_images import of_shot
 
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)), mapping_enabled=False)
 COVERED = range(24, 48)
@@ -57,8 +57,7 @@ def foreign_end(shots: Sequence[Shot], others: Sequence[Shot], begin: int) -> li
 def tracked(shots: Sequence[Shot], config: FrontendConfig = CONFIG) -> TrackedLog:
     tracker = SubmapTracker(SMALL, config)
     for s in shots:
-        image = s.color.astype(np.float32) / 255
-        tracker.track(RgbdImages(frame_index=s.index, stamp_ns=s.stamp_ns, image=image, depth_m=s.depth))
+        tracker.track(of_shot(s))
     return tracker.finish()
 
 
@@ -162,7 +161,7 @@ def test_a_camera_that_comes_back_is_relocalized_and_nothing_else_happens(walk) 
     log, tracker = tracked(shots), Tracker(SMALL, CONFIG)
     assert len(log.submaps) == 1
     for s, frame in zip(shots, log.frames, strict=True):
-        same = tracker.track(s.index, s.stamp_ns, s.color.astype(np.float32) / 255, s.depth)
+        same = tracker.track(of_shot(s))
         assert (same.status, same.reason, same.keyframe_index) == (
             frame.status,
             frame.reason,

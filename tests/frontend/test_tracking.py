@@ -16,6 +16,7 @@ from duagc.pipeline.geometry.trajectory import ate_rmse_m
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Motion
 from duagc.pipeline.registration import Reference, RgbdPyramid, register
+from tests.fixtures.frame_images import rgbd
 from tests.fixtures.room import CAMERA, pose, render
 
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
@@ -44,7 +45,7 @@ def positions(tracker: Tracker, frames: list[TrackedFrame]) -> np.ndarray:
 def walked() -> tuple[Tracker, list[TrackedFrame], list[np.ndarray]]:
     tracker = Tracker(CAMERA, CONFIG)
     truth = [walk(k) for k in range(STEPS)]
-    frames = [tracker.track(k, 33_333_333 * k, *render(T)) for k, T in enumerate(truth)]
+    frames = [tracker.track(rgbd(k, *render(T))) for k, T in enumerate(truth)]
     return tracker, frames, truth
 
 
@@ -95,7 +96,7 @@ def test_failed_images_are_lost_and_the_camera_is_found_again(spoil) -> None:
     frames = []
     for k in range(12):
         images = render(walk(0.5 * k))
-        frames.append(tracker.track(k, 33_333_333 * k, *(spoil(*images) if 5 <= k < 8 else images)))
+        frames.append(tracker.track(rgbd(k, *(spoil(*images) if 5 <= k < 8 else images))))
     status = [f.status for f in frames]
     assert status[5:8] == [Status.LOST] * 3
     for frame in frames[5:8]:
@@ -113,7 +114,7 @@ def keyframes_of(gains: np.ndarray) -> list[int]:
     tracker = Tracker(CAMERA, CONFIG)
     for k, gain in enumerate(gains):
         gray, depth = render(walk(1.5 * max(0, k - 9)))
-        assert tracker.track(k, 33_333_333 * k, gray * np.float32(gain), depth).status is not Status.LOST
+        assert tracker.track(rgbd(k, gray * np.float32(gain), depth)).status is not Status.LOST
     return [keyframe.frame_index for keyframe in tracker.keyframes]
 
 
@@ -136,7 +137,7 @@ def test_a_moving_object_behind_a_mask_leaves_the_poses_alone() -> None:
         for k in range(10):
             image, depth_m = render(walk(k))
             image, depth_m = np.where(usable, image, gray), np.where(usable, depth_m, np.minimum(depth, 0.8))
-            frames.append(tracker.track(k, 33_333_333 * k, image, depth_m, mask=usable if masked else None))
+            frames.append(tracker.track(rgbd(k, image, depth_m, mask=usable if masked else None)))
         truth = np.array([walk(k)[:3, 3] for k in range(10)])
         errors[masked] = ate_rmse_m(truth, positions(tracker, frames))
         assert not masked or all(f.status is Status.OK for f in frames)
@@ -148,9 +149,7 @@ def test_a_frame_without_a_usable_pixel_is_lost_and_said() -> None:
     tracker, none = Tracker(CAMERA, CONFIG), np.zeros((CAMERA.height, CAMERA.width), bool)
     frames = []
     for k in range(6):
-        frames.append(
-            tracker.track(k, 33_333_333 * k, *render(walk(0.5 * k)), mask=none if k in (0, 3) else None)
-        )
+        frames.append(tracker.track(rgbd(k, *render(walk(0.5 * k)), mask=none if k in (0, 3) else None)))
     assert [(f.status, f.reason) for f in frames] == [
         (Status.LOST, Reason.NO_PIXEL),
         (Status.OK, Reason.NONE),
@@ -167,7 +166,7 @@ def test_a_saturated_frame_is_lost_and_said_and_never_the_first_keyframe(value: 
     for k in range(6):
         gray, depth_m = render(walk(0.5 * k))
         shown = np.full_like(gray, value) if k in (0, 3) else gray
-        frames.append(tracker.track(k, 33_333_333 * k, shown, depth_m))
+        frames.append(tracker.track(rgbd(k, shown, depth_m)))
     assert [f.reason for f in frames] == [
         Reason.NO_PIXEL, Reason.NONE, Reason.NONE, Reason.NO_PIXEL, Reason.NONE, Reason.NONE,
     ]  # fmt: skip
@@ -203,7 +202,7 @@ def test_a_small_image_that_is_mostly_masked_begins_a_map() -> None:
     frames = []
     for k in range(STEPS // 2):
         image, depth_m = render(walk(k), camera=camera)
-        frames.append(tracker.track(k, 33_333_333 * k, image, depth_m, mask=usable))
+        frames.append(tracker.track(rgbd(k, image, depth_m, mask=usable)))
     reference = tracker.keyframes[0].reference
     assert len(reference.levels[2]) < CONFIG.tracking.registration.min_samples < len(reference.levels[0])
     assert all(frame.status is Status.OK for frame in frames)
@@ -214,15 +213,15 @@ def test_a_small_image_that_is_mostly_masked_begins_a_map() -> None:
 def test_depth_of_long_before_makes_no_keyframe() -> None:
     tracker = Tracker(CAMERA, CONFIG)
     far_ns = 50_000_000
-    first = tracker.track(0, 0, *render(walk(0)), depth_offset_ns=far_ns)
+    first = tracker.track(rgbd(0, *render(walk(0)), depth_offset_ns=far_ns))
     assert (first.status, first.reason) == (Status.LOST, Reason.NO_DEPTH)
-    frames = [tracker.track(k, 33_333_333 * k, *render(walk(k))) for k in (1, 2, 3)]
+    frames = [tracker.track(rgbd(k, *render(walk(k)))) for k in (1, 2, 3)]
     for k in range(4, 14):
         late = render(walk(k + 1.5))[1]
-        frames.append(tracker.track(k, 33_333_333 * k, render(walk(k))[0], late, depth_offset_ns=far_ns))
+        frames.append(tracker.track(rgbd(k, render(walk(k))[0], late, depth_offset_ns=far_ns)))
     assert all(f.status is Status.OK for f in frames)
     assert len(tracker.keyframes) == 1
-    frames.append(tracker.track(14, 33_333_333 * 14, *render(walk(14))))
+    frames.append(tracker.track(rgbd(14, *render(walk(14)))))
     assert len(tracker.keyframes) == 2
 
 
@@ -230,13 +229,13 @@ def test_a_copy_takes_depth_from_as_far_in_time() -> None:
     far_ns = 50_000_000
     wide = Tracker(CAMERA, CONFIG, max_depth_offset_s=0.06)
     for tracker in (wide, wide.copied(), wide.copied(CONFIG.model_copy())):
-        assert tracker.track(0, 0, *render(walk(0)), depth_offset_ns=far_ns).status is Status.OK
+        assert tracker.track(rgbd(0, *render(walk(0)), depth_offset_ns=far_ns)).status is Status.OK
 
 
 def test_too_large_a_motion_is_not_called_tracked() -> None:
     tracker = Tracker(CAMERA, CONFIG)
-    tracker.track(0, 0, *render(walk(0)))
-    turned = tracker.track(1, 33_333_333, *render(pose(x=0.9, z=0.3, yaw=-1.2)))
+    tracker.track(rgbd(0, *render(walk(0))))
+    turned = tracker.track(rgbd(1, *render(pose(x=0.9, z=0.3, yaw=-1.2))))
     assert turned.status is Status.LOST
 
 
@@ -262,7 +261,7 @@ def test_a_prior_carries_over_what_the_images_do_not_tell() -> None:
     prior = Walked(lambda ns: truth[round(ns / 33_333_333)], knows_translation=True)
     for motion, status in ((None, Status.LOST), (prior, Status.OK)):
         tracker = Tracker(CAMERA, CONFIG, motion)
-        frames = [tracker.track(k, 33_333_333 * k, gray, depth[k]) for k in range(len(truth))]
+        frames = [tracker.track(rgbd(k, gray, depth[k])) for k in range(len(truth))]
         assert [f.status for f in frames[1:]] == [status] * 7
     expected = se3.inverse(truth[0]) @ truth[-1]
     moved_m, turned_rad = se3.distance(expected, frames[-1].T_keyframe_camera)
@@ -277,7 +276,7 @@ def test_a_prior_does_not_spoil_what_the_images_tell(walked, knows_translation: 
     _, _, truth = walked
     prior = Walked(lambda ns: truth[round(ns / 33_333_333)], knows_translation)
     tracker = Tracker(CAMERA, CONFIG, prior)
-    frames = [tracker.track(k, 33_333_333 * k, *render(truth[k])) for k in range(16)]
+    frames = [tracker.track(rgbd(k, *render(truth[k]))) for k in range(16)]
     assert [f.status for f in frames] == [Status.OK] * 16
     assert ate_rmse_m(np.array(truth)[:16, :3, 3], positions(tracker, frames)) < 1e-3
 
@@ -291,7 +290,7 @@ def test_a_prior_follows_a_jerky_turn() -> None:
     )
     for motion, statuses in ((None, {Status.LOST}), (prior, {Status.OK})):
         tracker = Tracker(CAMERA, without_features, motion)
-        frames = [tracker.track(k, 33_333_333 * k, *render(truth[k])) for k in range(len(truth))]
+        frames = [tracker.track(rgbd(k, *render(truth[k]))) for k in range(len(truth))]
         assert {frame.status for frame in frames[1::2]} == statuses
     for frame, T in zip(frames, truth, strict=True):
         found = tracker.keyframes[frame.keyframe_index].T_map_keyframe @ frame.T_keyframe_camera
@@ -304,7 +303,7 @@ def test_equal_frames_give_equal_bits(walked) -> None:
     _, frames, truth = walked
     again = Tracker(CAMERA, CONFIG)
     for k in range(8):
-        repeated = again.track(k, 33_333_333 * k, *render(truth[k]))
+        repeated = again.track(rgbd(k, *render(truth[k])))
         np.testing.assert_array_equal(repeated.T_keyframe_camera, frames[k].T_keyframe_camera)
         np.testing.assert_array_equal(repeated.information, frames[k].information)
 
@@ -313,7 +312,7 @@ def test_keyframe_rules_can_be_loosened() -> None:
     rare = KeyframeConfig(min_overlap=0.3, max_translation_of_depth=9, max_rotation_rad=9)
     tracker = Tracker(CAMERA, CONFIG.model_copy(update={"keyframes": rare}))
     for k in range(0, STEPS, 4):
-        tracker.track(k, 33_333_333 * k, *render(walk(k)))
+        tracker.track(rgbd(k, *render(walk(k))))
     assert len(tracker.keyframes) == 1
 
 

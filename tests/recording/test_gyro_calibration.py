@@ -11,6 +11,7 @@ from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.recording import Motion
 from duagc.pipeline.recording.gyro_calibration import FEWEST, GyroCorrection, Turn
+from tests.fixtures.frame_images import rgbd
 from tests.fixtures.room import CAMERA, pose, render
 
 STATED = 0.02  # rad/s
@@ -114,7 +115,7 @@ def test_a_tracker_follows_a_walk_whatever_its_gyroscope_says() -> None:
     wrong = (np.eye(3), np.array([0.3, -0.3, 0.3])), (so3.exp([0, 0, np.pi / 2]), np.zeros(3))
     for R, bias in wrong:
         tracker = Tracker(CAMERA, config, Gyro(poses, R, bias))
-        frames = [tracker.track(k, 33_333_333 * k, *image) for k, image in enumerate(images)]
+        frames = [tracker.track(rgbd(k, *image)) for k, image in enumerate(images)]
         assert {frame.status for frame in frames} == {Status.OK}
         for frame, T in zip(frames, poses, strict=True):
             found = tracker.keyframes[frame.keyframe_index].T_map_keyframe @ frame.T_keyframe_camera
