@@ -324,14 +324,20 @@ class MapBuilder:
         read = partial(self._posed, frame_index, T_map_tracked)
         return JointView(frame_index, self._poses[frame_index], information, fixed, read)
 
-    def _posed(self, frame_index: int, T_map_tracked: Array) -> PosedRgbd:
-        """A frame at its pose before refinement, by which it is known what moves."""
+    def _posed(self, frame_index: int, T_map_tracked: Array, T_map_camera: Array | None = None) -> PosedRgbd:
+        """A frame at a pose; what moves in it is known by that before refinement.
+
+        Args:
+            frame_index: of the frame.
+            T_map_tracked: [4, 4], before refinement.
+            T_map_camera: [4, 4], as refined so far; None: not.
+        """
         frame = self.log.frame(frame_index)
         mask = self._still_pixels(frame, T_map_tracked)
         return PosedRgbd(
             frame.color,
             masked_depth(frame.depth, mask),
-            T_map_tracked,
+            T_map_tracked if T_map_camera is None else T_map_camera,
             mask,
             frame.depth_sigma,
             self.exposures.at(frame_index),
@@ -349,34 +355,16 @@ class MapBuilder:
     def _with_images(self, do: Callable[..., Result], index: int, *, seeds: bool = False) -> Result:
         """Hand a keyframe to the mapper; if it seeds, with the depth of what is too far to be measured."""
         do = partial(do, far_m=self._sights.far_m(index)) if seeds else do
-        keyframe, T_map_camera = self._keyframes[index], self._pose(index)
-        frame = self.log.frame(keyframe.frame_index)
-        return do(
-            index,
-            frame.color,
-            frame.depth,
-            T_map_camera,
-            mask=self._still_pixels(frame, keyframe.T_map_camera),
-            depth_sigma_m=frame.depth_sigma,
-            exposure=self.exposures.at(frame.index),
-            information=keyframe.information,
-        )
+        keyframe = self._keyframes[index]
+        posed = self._posed(keyframe.frame_index, keyframe.T_map_camera, self._pose(index))
+        return do(index, posed, information=keyframe.information)
 
-    def _support(self, mapper: Mapper, supporting: TrackedFrame) -> None:
+    def _support(self, mapper: Mapper, frame: TrackedFrame) -> None:
         """Add a frame to the views of the final optimization."""
-        frame = self.log.frame(supporting.frame_index)
-        T_map_keyframe = self._keyframes[supporting.keyframe_index].T_map_camera
-        T_map_camera = T_map_keyframe @ supporting.T_keyframe_camera
-        mapper.add_view(
-            supporting.keyframe_index,
-            frame.color,
-            frame.depth,
-            supporting.T_keyframe_camera,
-            mask=self._still_pixels(frame, T_map_camera),
-            depth_sigma_m=frame.depth_sigma,
-            exposure=self.exposures.at(frame.index),
-            information=supporting.information,
-        )
+        k, T_keyframe_camera = frame.keyframe_index, frame.T_keyframe_camera
+        T_map_tracked = self._keyframes[k].T_map_camera @ T_keyframe_camera
+        posed = self._posed(frame.frame_index, T_map_tracked, self._pose(k) @ T_keyframe_camera)
+        mapper.add_view(k, posed, information=frame.information)
 
     def _registered(
         self, frames: Sequence[TrackedFrame], T_map_keyframe: Array, views: frozenset[int]

@@ -26,16 +26,14 @@ from duagc.pipeline.config.training import DepthKind, LearningRates
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.map_content import MapContent
 from duagc.pipeline.frontend.mapping_budget import MappingBudget, alone_steps
-from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
+from duagc.pipeline.frontend.mapping_views import Image, View
 from duagc.pipeline.frontend.view_poses import PoseStep, PoseSteps
 from duagc.pipeline.frontend.view_selection import optimization_window
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.exposure import Exposure
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
-from duagc.pipeline.kernels import (
-    LossWeights,
-)
+from duagc.pipeline.kernels import LossWeights
 from duagc.pipeline.kernels.sparse_steps import EVERYTHING, LookedAt, SparseSteps
 from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep
 from duagc.pipeline.messages import Keyframe, MapUpdate
@@ -141,34 +139,45 @@ class Mapper(MapContent):
         """Whether the map has the depth kind of exact depth images."""
         return self.depth == "ray_plane"
 
-    def put_back(self, *view: Any, **more: Any) -> None:
+    def put_back(
+        self,
+        keyframe_index: int,
+        image: PosedRgbd,
+        *,
+        information: NDArray[np.float64] | None = None,
+        far_m: Image | None = None,
+    ) -> None:
         """Take in a keyframe of which a state follows, and do nothing for it.
 
         Args:
-            view: as of `add_keyframe`.
-            more: as of `add_keyframe`.
+            keyframe_index: as of `add_keyframe`.
+            image: as of `add_keyframe`.
+            information: as of `add_keyframe`.
+            far_m: as of `add_keyframe`.
         """
-        self._views.append(View.of(*view, loss=self._loss_weights, **more))
+        self._views.append(
+            View.of(keyframe_index, image, self._loss_weights, information=information, far_m=far_m)
+        )
 
-    def add_border(self, *view: Any, **more: Any) -> None:
+    def add_border(
+        self, keyframe_index: int, image: PosedRgbd, *, information: NDArray[np.float64] | None = None
+    ) -> None:
         """Take in a keyframe of another tile, which sees some of this one; its pose stays.
 
         Args:
-            view: as of `add_keyframe`.
-            more: as of `add_keyframe`.
+            keyframe_index: as of `add_keyframe`.
+            image: as of `add_keyframe`.
+            information: as of `add_keyframe`.
         """
-        self._borders.append(SHELF.put(View.of(*view, loss=self._loss_weights, **more)))
+        self._borders.append(
+            SHELF.put(View.of(keyframe_index, image, self._loss_weights, information=information))
+        )
 
     def add_keyframe(
         self,
         keyframe_index: int,
-        color: Bytes,
-        depth_m: Image,
-        T_map_camera: NDArray[np.float64],
+        image: PosedRgbd,
         *,
-        mask: NDArray[np.bool_] | None = None,
-        depth_sigma_m: Image | None = None,
-        exposure: Exposure | None = None,
         information: NDArray[np.float64] | None = None,
         far_m: Image | None = None,
         iterations: int | None = None,
@@ -177,12 +186,8 @@ class Mapper(MapContent):
 
         Args:
             keyframe_index: 0, 1, 2, ... in order of arrival; a tile has some of them.
-            color: RGB [H, W, 3]; kept, not copied.
-            depth_m: meters [H, W], 0 where there is none; kept, not copied.
-            T_map_camera: [4, 4], pose of the camera in the map frame.
-            mask: bool [H, W], False where a pixel neither seeds nor counts in a loss; None = all count.
-            depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
-            exposure: of the image; None: as the map.
+            image: with its pose in the map frame; kept, not copied. Pixels outside its mask neither seed nor count in
+                a loss.
             information: [6, 6] of the pose; None: nothing is known of it.
             far_m: [H, W], depth of what was too far to be measured, meters, 0 where it is unknown; None: nowhere.
             iterations: most optimization steps; None: those of the configuration.
@@ -190,18 +195,7 @@ class Mapper(MapContent):
         last = self._views[-1].index if self._views else -1
         if keyframe_index <= last or (last < 0 and not self._tile and keyframe_index):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
-        view = View.of(
-            keyframe_index,
-            color,
-            depth_m,
-            T_map_camera,
-            mask=mask,
-            depth_sigma_m=depth_sigma_m,
-            loss=self._loss_weights,
-            exposure=exposure,
-            information=information,
-            far_m=far_m,
-        )
+        view = View.of(keyframe_index, image, self._loss_weights, information=information, far_m=far_m)
         first = not self._views and not len(self._map)
         self._views.append(view)
         self._map.adam.freeze_after(self.config.stable_steps or None)
@@ -226,16 +220,7 @@ class Mapper(MapContent):
         return MappingStats(inserted, pruned, len(self._map), before, after)
 
     def add_view(
-        self,
-        keyframe_index: int,
-        color: Bytes,
-        depth_m: Image,
-        T_keyframe_camera: NDArray[np.float64],
-        *,
-        mask: NDArray[np.bool_] | None = None,
-        depth_sigma_m: Image | None = None,
-        exposure: Exposure | None = None,
-        information: NDArray[np.float64] | None = None,
+        self, keyframe_index: int, image: PosedRgbd, *, information: NDArray[np.float64] | None = None
     ) -> None:
         """Let a tracked frame that is no keyframe take part in `finalize`.
 
@@ -243,27 +228,10 @@ class Mapper(MapContent):
 
         Args:
             keyframe_index: the keyframe that it is anchored to.
-            color: RGB [H, W, 3]; kept, not copied.
-            depth_m: meters [H, W], 0 where there is none; kept, not copied.
-            T_keyframe_camera: [4, 4], pose of the camera in the keyframe.
-            mask: bool [H, W], False where a pixel does not count; None = all count.
-            depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
-            exposure: of the image; None: as the map.
+            image: with its pose in the map frame; kept, not copied.
             information: [6, 6] of the pose; None: nothing is known of it.
         """
-        keyframe = next(view for view in self._views if view.index == keyframe_index)
-        view = View.of(
-            keyframe_index,
-            color,
-            depth_m,
-            keyframe.T_map_camera @ T_keyframe_camera,
-            mask=mask,
-            depth_sigma_m=depth_sigma_m,
-            loss=self._loss_weights,
-            exposure=exposure,
-            information=information,
-        )
-        self._support.append(view)
+        self._support.append(View.of(keyframe_index, image, self._loss_weights, information=information))
 
     def finalize(
         self,

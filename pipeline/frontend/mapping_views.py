@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.geometry import masks, projection, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure, unit_color, unit_table
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels.training import TrainingView
 from duagc.pipeline.splat.losses import DepthTrust, depth_certainty, halve
 
@@ -68,52 +69,44 @@ class View:
     def of(
         cls,
         index: int,
-        color: Bytes,
-        depth_m: Image,
-        T_map_camera: NDArray[np.float64],
-        *,
-        mask: NDArray[np.bool_] | None,
-        depth_sigma_m: Image | None,
+        image: PosedRgbd,
         loss: DepthTrust,
-        exposure: Exposure | None = None,
+        *,
         information: NDArray[np.float64] | None = None,
         far_m: Image | None = None,
     ) -> View:
         """A view of images that are kept, not copied, but for depth where a mask forbids pixels.
 
+        The camera stands still until `Mapper.open_shutter` says otherwise.
+
         Args:
             index: of the keyframe.
-            color: uint8 RGB [H, W, 3].
-            depth_m: [H, W], meters, 0 = unknown.
-            T_map_camera: [4, 4].
-            mask: bool [H, W], pixels that may be used; None = all.
-            depth_sigma_m: [H, W], standard deviation of the depth, meters; None = not known pixel by pixel.
+            image: with its pose in the map frame.
             loss: how much uncertain depth counts.
-            exposure: of the image; None = as the map.
             information: [6, 6] of the pose; None = nothing is known of it.
             far_m: [H, W], depth that is no measurement, meters, 0 = unknown; None = nowhere.
         """
-        if color.dtype != np.uint8:
-            raise ValueError(f"color is an array of {color.dtype}, expected uint8")
-        depth_m = masks.masked_depth(depth_m, mask)
+        if image.color.dtype != np.uint8:
+            raise ValueError(f"color is an array of {image.color.dtype}, expected uint8")
+        depth_m, mask = image.usable_depth, image.mask
         near = depth_m[::8, ::8]
-        certainty = depth_certainty(depth_m, depth_sigma_m, loss)
+        certainty = depth_certainty(depth_m, image.depth_sigma_m, loss)
         return cls(
             index=index,
-            color=color,
+            color=image.color,
             depth_m=depth_m,
-            half_color=halve(unit_color(color, exposure)),
+            half_color=halve(image.unit_color),
             half_depth_m=halve_depth(depth_m),
-            T_map_camera=np.array(T_map_camera, dtype=np.float64),
+            T_map_camera=np.array(image.T_world_camera, dtype=np.float64),
             median_depth_m=float(np.median(near[near > 0])) if near.any() else 0.0,
             mask=mask,
             half_mask=None if mask is None else masks.halved(mask),
-            depth_sigma_m=depth_sigma_m,
+            depth_sigma_m=image.depth_sigma_m,
             certainty=certainty,
             half_certainty=None if certainty is None else halve(certainty),
-            exposure=exposure,
+            exposure=image.exposure,
             information=np.zeros((6, 6)) if information is None else information,
-            T_map_begun=np.array(T_map_camera, dtype=np.float64),
+            T_map_begun=np.array(image.T_world_camera, dtype=np.float64),
             far_m=None
             if far_m is None
             else np.where(depth_m > 0, np.float32(0), masks.masked_depth(far_m, mask)),

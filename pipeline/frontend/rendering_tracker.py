@@ -27,6 +27,7 @@ from duagc.pipeline.frontend.other_tracker import OtherTracker, Placed, ReadFram
 from duagc.pipeline.geometry import masks, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import mad_sigma
 from duagc.pipeline.kernels import LossWeights, Rasterizer
 from duagc.pipeline.registration.search import orthonormal
@@ -256,16 +257,7 @@ class RenderingTracker(OtherTracker):
         """
         if keyframe is not None:
             self._exposures.append(self._exposure)
-            small = self._small(images)
-            self._mapper.add_keyframe(
-                keyframe,
-                small.color,
-                small.depth_m,
-                T_map_camera,
-                mask=small.mask,
-                depth_sigma_m=small.depth_sigma_m,
-                exposure=_exposure_of(self._exposure),
-            )
+            self._mapper.add_keyframe(keyframe, self._posed(images, T_map_camera, self._exposure))
 
     def map_state(self) -> Any:
         """The map and the last exposure; images of keyframes are read again."""
@@ -279,17 +271,17 @@ class RenderingTracker(OtherTracker):
         """
         of_map, self._exposure, self._exposures = state
         for keyframe, exposure in zip(self._keyframes, self._exposures, strict=True):
-            small = self._small(RgbdImages.of(self.read(keyframe.frame_index)))
-            self._mapper.put_back(
-                keyframe.keyframe_index,
-                small.color,
-                small.depth_m,
-                keyframe.T_map_keyframe,
-                mask=small.mask,
-                depth_sigma_m=small.depth_sigma_m,
-                exposure=_exposure_of(exposure),
-            )
+            images = RgbdImages.of(self.read(keyframe.frame_index))
+            posed = self._posed(images, keyframe.T_map_keyframe, exposure)
+            self._mapper.put_back(keyframe.keyframe_index, posed)
         self._mapper.go_on(of_map)
+
+    def _posed(self, images: RgbdImages, T_map_camera: Array, exposure: tuple[float, float]) -> PosedRgbd:
+        """A frame in the size of the map."""
+        small = self._small(images)
+        return PosedRgbd(
+            small.color, small.depth_m, T_map_camera, small.mask, small.depth_sigma_m, _exposure_of(exposure)
+        )
 
     def _small(self, images: RgbdImages) -> FitImages:
         return FitImages.of(images, self._halvings)

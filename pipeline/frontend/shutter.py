@@ -143,16 +143,7 @@ class ShutterSearch:
 
     def _image(self, frame: Frame) -> TrainingView:
         image = self._read(frame.frame_index, self._T_map_camera[frame.stamp_ns])
-        view = View.of(
-            frame.frame_index,
-            image.color,
-            image.depth_m,
-            image.T_world_camera,
-            mask=image.mask,
-            depth_sigma_m=image.depth_sigma_m,
-            loss=self._step.loss,
-            exposure=image.exposure,
-        )
+        view = View.of(frame.frame_index, image, self._step.loss)
         return view.training(self._level)
 
     def _best_s(self, gaussians: Gaussians, compared: Sequence[_Timed], from_s: float) -> float:

@@ -8,7 +8,7 @@ from duagc.pipeline.frontend.mapping import Mapper
 from duagc.pipeline.frontend.mapping_views import halve_depth
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Rasterizer
-from tests.frontend.test_mapping import CAMERA, POSES, QUICK, build, drawn, shot
+from tests.frontend.test_mapping import CAMERA, POSES, QUICK, build, drawn, posed
 
 
 @pytest.mark.parametrize("halvings", [1, 2])
@@ -50,7 +50,7 @@ def test_what_was_seen_elsewhere_is_not_given_up_for_what_is_seen_now() -> None:
         crowded = {"max_gaussians": 70, "first_share": 0.6, "keyframe_share": 0.3, "sweep_keyframes": sweep}
         crowded |= {"max_scale_m": 0.2, "sparse": SparseStepsConfig(checkerboard=False, closing=0.0)}
         mapper = Mapper(CAMERA, QUICK.model_copy(update=crowded), seed=0)
-        stats = [mapper.add_keyframe(k, *shot(pose), pose) for k, pose in enumerate(turns)]
+        stats = [mapper.add_keyframe(k, posed(pose)) for k, pose in enumerate(turns)]
         assert sum(s.pruned for s in stats) > 50
         covered.append(drawn(mapper, turns[0])[2])
     assert covered[0] > covered[1] - 0.1  # 0.85 and 0.88 measured; 0.77 if the sweep looks at one keyframe

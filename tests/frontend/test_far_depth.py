@@ -14,6 +14,7 @@ from duagc.pipeline.frontend.far_depth import FarDepth
 from duagc.pipeline.frontend.mapping import Mapper
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.recording import read_log
 from duagc.schemas import topics
 from tests.frontend.test_checkpoints import SMALL, Runs, undisturbed
@@ -94,7 +95,7 @@ def test_a_map_is_seeded_there_and_is_not_trained_on_it() -> None:
     far_m = found()
     mappers = [Mapper(CAMERA, MappingConfig(max_gaussians=4000, iterations=0), seed=0) for _ in range(2)]
     for mapper, more in zip(mappers, ({}, {"far_m": far_m}), strict=True):
-        mapper.add_keyframe(0, color, depth_m, np.eye(4), **more)
+        mapper.add_keyframe(0, PosedRgbd(color, depth_m, np.eye(4)), **more)
     near, all_of_it = (mapper.gaussians for mapper in mappers)
     assert near.means[:, 2].max() < RANGE_M + 0.1
     far = all_of_it.means[:, 2] > 1.5 * RANGE_M

@@ -12,7 +12,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
-from tests.frontend.test_mapping import CAMERA, POSES, same, shot
+from tests.frontend.test_mapping import CAMERA, POSES, posed, same, shot
 
 CONFIG = MappingConfig(max_gaussians=2000, iterations=10)
 UNSEEN_ID = 10**6
@@ -24,7 +24,7 @@ def _whole() -> GrowingMap:
     """A map of two views, and a Gaussian behind all of them."""
     mapper = Mapper(CAMERA, CONFIG, seed=5)
     for k in range(2):
-        mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
+        mapper.add_keyframe(k, posed(POSES[k]))
     whole = mapper.growing_map
     hidden = whole.gaussians.select(slice(1))
     whole.append(hidden.replace(means=np.array([[0, 0, -5]], np.float32), ids=np.array([UNSEEN_ID])))

@@ -1,7 +1,5 @@
 """The mapper on a small room corner whose images are computed exactly."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -17,6 +15,7 @@ from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 from duagc.pipeline.frontend.mapping_views import View, view_overlap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -43,11 +42,15 @@ def shot(T_map_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.rint(255 * (0.5 + 0.3 * np.sin(phase))).astype(np.uint8), z.astype(np.float32)
 
 
+def posed(T_map_camera: np.ndarray) -> PosedRgbd:
+    return PosedRgbd(*shot(T_map_camera), T_map_camera)
+
+
 def build(
     config: MappingConfig = QUICK, views: int = 3, threads: int = 1
 ) -> tuple[Mapper, list[MappingStats]]:
     mapper = Mapper(CAMERA, config, seed=5, threads=threads)
-    stats = [mapper.add_keyframe(k, *shot(POSES[k]), POSES[k]) for k in range(views)]
+    stats = [mapper.add_keyframe(k, posed(POSES[k])) for k in range(views)]
     return mapper, stats
 
 
@@ -92,7 +95,7 @@ def test_a_scene_of_another_size_is_mapped_as_well(scale: float) -> None:
             depth_m = (factor * depth_m * (1 + 0.02 * noise)).astype(np.float32)
             T = pose.copy()
             T[:3, 3] *= factor
-            mapper.add_keyframe(k, color, depth_m, T)
+            mapper.add_keyframe(k, PosedRgbd(color, depth_m, T))
         mapper.finalize()
         between = POSES[1] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[1]) @ POSES[2]))
         color, depth_m = shot(between)
@@ -124,7 +127,7 @@ def test_the_same_bits_whatever_the_threads() -> None:
 def test_the_seed_matters_and_nothing_else_drew_from_it() -> None:
     other = Mapper(CAMERA, QUICK, seed=6)
     for k in range(3):
-        other.add_keyframe(k, *shot(POSES[k]), POSES[k])
+        other.add_keyframe(k, posed(POSES[k]))
     mapper, _ = build()
     assert same(mapper.gaussians, other.gaussians)  # too few keyframes for random ones
     mapper.finalize()
@@ -139,7 +142,7 @@ def test_the_cap_holds_at_every_keyframe_and_ids_are_never_used_twice() -> None:
     pruned = 0
     for k in range(4):
         before = set(mapper.gaussians.ids.tolist())
-        stats = mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
+        stats = mapper.add_keyframe(k, posed(POSES[k]))
         now = mapper.gaussians.ids
         assert len(now) == stats.total <= 150
         assert (np.diff(now) > 0).all()
@@ -158,7 +161,7 @@ def test_a_view_that_is_explained_adds_little() -> None:
     _, stats = build()
     assert stats[1].inserted < 0.5 * stats[0].inserted
     mapper, _ = build(MappingConfig(max_gaussians=4000, iterations=40, iterations_level=0), views=1)
-    again = mapper.add_keyframe(1, *shot(POSES[0]), POSES[0])
+    again = mapper.add_keyframe(1, posed(POSES[0]))
     assert again.inserted < 0.05 * len(mapper.gaussians)
 
 
@@ -182,7 +185,7 @@ def test_views_between_keyframes_help() -> None:
     alone, _ = build(config, views=1)
     alone.finalize()
     helped, _ = build(config, views=1)
-    helped.add_view(0, *shot(between), se3.inverse(POSES[0]) @ between)
+    helped.add_view(0, posed(between))
     helped.finalize()
     assert drawn(helped, between)[0] > drawn(alone, between)[0] + 0.5
 
@@ -199,7 +202,7 @@ def test_a_pose_that_is_off_is_refined_unless_depth_is_exact(noise_m: float) -> 
     mapper = Mapper(CAMERA, config, seed=5, depth=config.depth_kind(noise_m))
     off = POSES[2] @ se3.exp(np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0]))
     for k, T in enumerate((POSES[0], POSES[1], off)):
-        mapper.add_keyframe(k, *shot(POSES[k]), T)
+        mapper.add_keyframe(k, PosedRgbd(*shot(POSES[k]), T))
     before_m = _wrong_by_m(mapper, POSES[2])
     mapper.finalize()
     np.testing.assert_array_equal(mapper.keyframe_poses[0], POSES[0])
@@ -216,8 +219,8 @@ def test_what_only_a_supporting_view_saw_is_mapped() -> None:
     seen = {}
     for seeds in (True, False):
         mapper = Mapper(CAMERA, config.model_copy(update={"support_seeds": seeds}), seed=5)
-        mapper.add_keyframe(0, *shot(POSES[0]), POSES[0])
-        mapper.add_view(0, color, depth, se3.inverse(POSES[0]) @ aside)
+        mapper.add_keyframe(0, posed(POSES[0]))
+        mapper.add_view(0, PosedRgbd(color, depth, aside))
         mapper.finalize()
         seen[seeds] = drawn(mapper, mapper.support_poses[0])[2]
     assert seen[True] > 0.97
@@ -228,7 +231,7 @@ def test_a_map_without_anything_stays_empty() -> None:
     mapper = Mapper(CAMERA, QUICK, seed=0)
     assert mapper.finalize() == MappingStats(0, 0, 0, 0.0, 0.0)
     color, depth = shot(POSES[0])
-    stats = mapper.add_keyframe(0, color, np.zeros_like(depth), POSES[0])
+    stats = mapper.add_keyframe(0, PosedRgbd(color, np.zeros_like(depth), POSES[0]))
     assert (stats.inserted, stats.total) == (0, 0)
     assert mapper.finalize().total == 0
 
@@ -239,7 +242,7 @@ def test_refinement_spends_what_is_free_where_images_are_drawn_worst() -> None:
         Mapper(CAMERA, config.model_copy(update={"densify_rounds": rounds}), seed=0) for rounds in (0, 3)
     )
     for mapper in (plain, dense):
-        mapper.add_keyframe(0, *shot(POSES[0]), POSES[0])
+        mapper.add_keyframe(0, posed(POSES[0]))
     assert plain.finalize().inserted == 0
     stats = dense.finalize()
     assert stats.inserted > 0
@@ -290,7 +293,7 @@ def test_overlap_is_a_share_of_the_first_view() -> None:
     def view(k: int, T: np.ndarray, known: bool = True) -> View:
         color, depth = shot(POSES[k])
         depth = depth if known else np.zeros_like(depth)
-        return View.of(k, color, depth, T, mask=None, depth_sigma_m=None, loss=LossConfig(depth_huber_m=0.01))
+        return View.of(k, PosedRgbd(color, depth, T), LossConfig(depth_huber_m=0.01))
 
     first = view(0, POSES[0])
     assert view_overlap(first, first, CAMERA, stride_px=4) == 1.0
@@ -303,10 +306,8 @@ def test_overlap_is_a_share_of_the_first_view() -> None:
 @pytest.mark.parametrize("index", [1, -1])
 def test_keyframes_come_in_order(index: int) -> None:
     mapper = Mapper(CAMERA, QUICK, seed=0)
-    color, depth = shot(POSES[0])
-    arguments: Any = (index, color, depth, POSES[0])
     with pytest.raises(ValueError, match="after 0 keyframes"):
-        mapper.add_keyframe(*arguments)
+        mapper.add_keyframe(index, posed(POSES[0]))
 
 
 def test_masked_pixels_neither_seed_nor_count() -> None:
@@ -321,8 +322,9 @@ def test_masked_pixels_neither_seed_nor_count() -> None:
             color, depth = shot(POSES[k])
             color, depth = color.copy(), depth.copy()
             color[~mask], depth[~mask] = (card, 0, 0), 0.5
-            mapper.add_keyframe(k, color, depth, POSES[k], mask=mask)
-        mapper.add_view(1, color, depth, np.eye(4), mask=mask)
+            image = PosedRgbd(color, depth, POSES[k], mask)
+            mapper.add_keyframe(k, image)
+        mapper.add_view(1, image)
         mapper.finalize()
         return mapper
 

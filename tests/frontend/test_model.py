@@ -11,6 +11,7 @@ from duagc.pipeline.frontend.mapping import Mapper
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.recording import RgbdFrame
 from duagc.pipeline.registration import RegistrationConfig
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -37,7 +38,7 @@ def room_map(seed: int) -> Gaussians:
     )
     mapper = Mapper(CAMERA, config, seed=seed, depth="blended")
     for k, T in enumerate((KEYFRAME, pose(x=-0.1, z=-0.9), pose(x=0.12, z=-0.85, yaw=0.05))):
-        mapper.add_keyframe(k, *image(T), se3.inverse(KEYFRAME) @ T)
+        mapper.add_keyframe(k, PosedRgbd(*image(T), se3.inverse(KEYFRAME) @ T))
     mapper.finalize()
     return mapper.gaussians
 

@@ -19,7 +19,7 @@ from duagc.pipeline.recording import LogWriter
 from duagc.pipeline.recording.depth_motion import DepthMotion
 from duagc.pipeline.recording.shutter import found_shutter_s, stated_shutter_s
 from duagc.pipeline.splat.gaussians import Gaussians
-from tests.frontend.test_mapping import CAMERA, POSES, QUICK, build, same, shot
+from tests.frontend.test_mapping import CAMERA, POSES, QUICK, build, posed, same
 
 FRAME_S, SHUTTER_S = 1 / 30, 0.03
 FRAMES = 24
@@ -106,7 +106,7 @@ def test_moments_change_the_final_optimization_only_in_its_last_part() -> None:
     for given, moving_from in ((None, 0.7), (moments, 1.0), (moments, 0.7)):
         config = QUICK.model_copy(update={"sparse": SparseStepsConfig(moving_from=moving_from)})
         mapper, _ = build(config)
-        mapper.add_view(2, *shot(POSES[3]), se3.inverse(POSES[2]) @ POSES[3])
+        mapper.add_view(2, posed(POSES[3]))
         mapper.open_shutter([given] * 4)
         mapper.finalize()
         maps.append(mapper.gaussians)

@@ -17,7 +17,7 @@ from duagc.pipeline.geometry.view_extent import ViewExtent
 from duagc.pipeline.kernels import LossWeights, Rasterizer
 from duagc.pipeline.kernels.training import ScaleLimits, TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
-from tests.frontend.test_mapping import CAMERA, POSES, QUICK, drawn, same, shot
+from tests.frontend.test_mapping import CAMERA, POSES, QUICK, drawn, posed, same, shot
 
 
 def test_every_keyframe_is_in_one_tile_with_its_neighbors() -> None:
@@ -71,7 +71,7 @@ def test_a_view_sees_what_is_in_it_and_not_behind_its_depth(
 def _grown(views: int) -> GrowingMap:
     mapper = Mapper(CAMERA, QUICK, seed=5)
     for k in range(views):
-        mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
+        mapper.add_keyframe(k, posed(POSES[k]))
     return mapper.growing_map
 
 
@@ -106,7 +106,7 @@ def test_what_is_taken_out_and_put_back_is_the_same_map(monkeypatch: pytest.Monk
 
 def _border(mapper: Mapper, keyframes: Iterable[int]) -> None:
     for k in keyframes:
-        mapper.add_border(k, *shot(POSES[k]), POSES[k], mask=None, depth_sigma_m=None)
+        mapper.add_border(k, posed(POSES[k]))
 
 
 def test_only_the_images_of_its_tile_change_a_gaussian_in_the_end() -> None:
@@ -117,8 +117,8 @@ def test_only_the_images_of_its_tile_change_a_gaussian_in_the_end() -> None:
     mapper = Mapper(CAMERA, QUICK, seed=5, begun=part, tile=1)
     _border(mapper, [1])
     for k in (2, 3):
-        mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
-    mapper.add_view(3, *shot(POSES[3] @ se3.exp(np.full(6, 0.01))), se3.exp(np.full(6, 0.01)))
+        mapper.add_keyframe(k, posed(POSES[k]))
+    mapper.add_view(3, posed(POSES[3] @ se3.exp(np.full(6, 0.01))))
     guests = _by_id(mapper.gaussians.select(mapper.growing_map.is_guest))
     stats = mapper.finalize()
     assert stats.loss_after < stats.loss_before
@@ -139,9 +139,9 @@ def _tiled(config: MappingConfig, tiles: Sequence[Sequence[int]], threads: int =
             _border(mapper, others)
             for k in tile:
                 if final:
-                    mapper.put_back(k, *shot(POSES[k]), POSES[k], mask=None, depth_sigma_m=None)
+                    mapper.put_back(k, posed(POSES[k]))
                 else:
-                    mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
+                    mapper.add_keyframe(k, posed(POSES[k]))
             if final:
                 mapper.finalize()
             whole.put_back(mapper.growing_map)
@@ -152,7 +152,7 @@ def test_tiles_are_drawn_as_well_as_one_map_with_the_same_bits_whatever_the_thre
     config = MappingConfig(max_gaussians=4000, iterations=20, final_iterations=15)
     one = Mapper(CAMERA, config, seed=5)
     for k in range(4):
-        one.add_keyframe(k, *shot(POSES[k]), POSES[k])
+        one.add_keyframe(k, posed(POSES[k]))
     one.finalize()
     tiled = _tiled(config, ([0, 1], [2, 3]))
     between = POSES[1] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[1]) @ POSES[2]))
