@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from duagc.converters.simulate.render import bake
-from duagc.converters.simulate.render.renderer import Renderer
+from duagc.converters.simulate.render.renderer import RenderedView, Renderer
 from duagc.converters.simulate.scenes.catalog import build
 from duagc.converters.simulate.scenes.scene import Ball, Scene, Side, Surface
 from duagc.converters.simulate.settings import camera_of
@@ -54,23 +54,31 @@ def around(first_deg: float, last_deg: float, height_m: float) -> np.ndarray:
     return look_at(TABLE + circle, TABLE + 0.1 * np.stack([np.sin(5 * a), np.cos(4 * a), 0 * a], 1))
 
 
+PATHS = (around(200, 290, height_m=1.1), around(230, 320, height_m=1.05))
+
+
+@cache
+def renderer(way_m: tuple[float, float]) -> Renderer:
+    scene = moved(build("room", 0), way_m)
+    return Renderer(scene, bake.bake(scene, 0.004), CAMERA)
+
+
+@cache
+def views(path: int, way_m: tuple[float, float]) -> list[RenderedView]:
+    return [renderer(way_m).render(T) for T in PATHS[path]]
+
+
 @cache
 def recorded(way_m: tuple[float, float]) -> tuple[list[Shot], np.ndarray]:
     """Views around the table, a covered lens, views around the table where it is then; and T_world_camera."""
-    paths = [around(200, 290, height_m=1.1), around(230, 320, height_m=1.05)]
-    views = []
-    for path, way in zip(paths, (STILL, way_m), strict=True):
-        scene = moved(build("room", 0), way)
-        renderer = Renderer(scene, bake.bake(scene, 0.004), CAMERA)
-        views.append([renderer.render(T) for T in path])
     rng, shape = np.random.default_rng(0), (CAMERA.height, CAMERA.width)
     images = [
         (np.clip(view.color + rng.normal(0, 2, view.color.shape), 0, 255).astype(np.uint8), view.depth)
-        for view in (*views[0], *views[1])
+        for view in (*views(0, STILL), *views(1, way_m))
     ]
     images[FRAMES:FRAMES] = [(np.zeros((*shape, 3), np.uint8), np.zeros(shape))] * COVERED
     shots = [Shot(k, k * FRAME_NS, color, d.astype(np.float32)) for k, (color, d) in enumerate(images)]
-    return shots, np.concatenate([paths[0], np.full((COVERED, 4, 4), np.nan), paths[1]])
+    return shots, np.concatenate([PATHS[0], np.full((COVERED, 4, 4), np.nan), PATHS[1]])
 
 
 def pyramid(shot: Shot, levels: int) -> RgbdPyramid:
