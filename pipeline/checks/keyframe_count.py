@@ -1,7 +1,9 @@
 """How many keyframes a front end will make of a log, from some places of it on small images.
 
-From each place on, frames are registered at growing gaps until one would become the next keyframe. Keyframes come once
-in so many frames there; the mean over places that are spread evenly over the log is the rate of the whole log.
+From a frame on, others are registered at growing gaps until one would become the next keyframe, and from there on again
+until a place lies between two: keyframes come once in so many frames there. The mean over places that are spread evenly
+over the log is the rate of the whole log. A place itself is no keyframe: where a camera turns back, it sees least of
+what comes; one that turns to and fro keeps the keyframe that it made on its way.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ REGISTRATION = RegistrationConfig(
 )  # more than by default: gaps are long, nothing is predicted
 STRIDES = (2, 1, 1)
 FIRST_GAP = 4  # frames; later places begin with half of what the one before found
+MOST_HOPS = 6  # keyframes from one to the next, before a place
 SIGMAS = 2.0  # of the mean over places
 MODEL = 0.1  # relative: what small images and straight lines between gaps are wrong by (docs/lab, keyframes-of-a-log)
 
@@ -56,12 +59,9 @@ def count_keyframes(log: RgbdLog, config: KeyframeChecks, rule: KeyframeConfig) 
     last = len(log) - 1
     count = max(1, min(config.places, len(log) // config.frames_per_place))
     starts = np.unique((np.arange(count) + 0.5) / count * last).astype(int).tolist()
-    rates, first = [], FIRST_GAP
-    for start in starts:
-        gap = _Place(log, start, config.max_width, rule).gap(first) if start < last else None
-        if gap is not None:
-            rates.append(1 / gap)
-            first = max(1, round(gap / 2)) if gap < len(log) else first
+    chain = _Chain(log, config.max_width, rule)
+    gaps = [chain.gap_around(start) if start < last else None for start in starts]
+    rates = [1 / gap for gap in gaps if gap is not None]
     return _count(len(log), rates, len(starts) - len(rates))
 
 
@@ -78,11 +78,61 @@ def _count(frames: int, rates: Sequence[float], failed: int) -> KeyframeCount:
     return KeyframeCount(expected, low, high)
 
 
+class _Chain:
+    """Keyframes one after another, as a tracker would make them; it jumps where the next place is far."""
+
+    def __init__(self, log: RgbdLog, max_width: int, rule: KeyframeConfig) -> None:
+        self._log, self._width, self._rule = log, max_width, rule
+        self._first = FIRST_GAP
+        self._gap: float | None = None  # frames between the last two keyframes
+        self._at = 0  # frame of the last one
+        self._guessed = False  # whether that is a frame that may be none
+
+    def gap_around(self, place: int) -> float | None:
+        """Frames between the keyframes before and after a frame; infinite: it shows nothing; None: nothing registers.
+
+        Args:
+            place: index of the frame, later than that of the call before.
+        """
+        if place < self._at:
+            return self._gap
+        if self._at and not (self._gap and place - self._at <= MOST_HOPS * self._gap < math.inf):
+            self._start(place if self._gap in (None, math.inf) else place - math.ceil(self._gap))
+        for _ in range(MOST_HOPS):
+            begun, guessed = self._at, self._guessed
+            gap = self._hop()
+            if self._at > begun:
+                self._gap = gap
+                if self._at > place and not guessed:
+                    break
+            elif begun < place:
+                self._start(place)
+            else:
+                self._gap = gap if begun == place else self._gap
+                break
+        return self._gap
+
+    def _start(self, frame: int) -> None:
+        self._at, self._guessed = frame, True
+
+    def _hop(self) -> float | None:
+        """Go on to the next keyframe, or as far as it is known that there is none; the frames to the next one."""
+        if self._at >= len(self._log) - 1:
+            return None
+        place = _Place(self._log, self._at, self._width, self._rule)
+        gap = place.gap(self._first)
+        if gap is not None and gap < len(self._log):
+            self._first = max(1, round(gap / 2))
+        self._at, self._guessed = self._at + place.known, not place.found
+        return gap
+
+
 class _Place:
     """Frames that follow one frame, which would be a keyframe."""
 
     def __init__(self, log: RgbdLog, start: int, max_width: int, rule: KeyframeConfig) -> None:
         self._log, self._start, self._width, self._rule = log, start, max_width, rule
+        self._pyramids: dict[int, RgbdPyramid] = {}  # by gap: what was too far is tried again from nearer
         self._reference = Reference.from_pyramid(self._pyramid(0), STRIDES)
         self._last = len(log) - 1 - start
         self._near = (0, 0.0, np.eye(4))  # gap, view lost, motion
@@ -109,6 +159,16 @@ class _Place:
                 self._near = gap, lost, T
             step = self._step()
         return self._between() if self._near[0] or self._far else None
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a next keyframe."""
+        return self._far is not None
+
+    @property
+    def known(self) -> int:
+        """Frames up to the next keyframe, or up to the last of which it is known that it is none."""
+        return math.ceil(self._between()) if self.found else self._near[0]
 
     def _step(self) -> int:
         """How many frames to go on; 0: it is known between which two the next keyframe comes."""
@@ -145,6 +205,11 @@ class _Place:
 
     def _pyramid(self, gap: int) -> RgbdPyramid:
         """Small images of a frame, three levels."""
+        if gap not in self._pyramids:
+            self._pyramids[gap] = self._built(gap)
+        return self._pyramids[gap]
+
+    def _built(self, gap: int) -> RgbdPyramid:
         frame, width = self._log.frame(self._start + gap), self._log.camera.width
         skipped = max(0, math.ceil(math.log2(width / self._width)))
         pyramid = RgbdPyramid.build(

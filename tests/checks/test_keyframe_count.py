@@ -55,6 +55,32 @@ def test_a_keyframe_comes_whenever_a_fifth_of_the_view_is_lost(speed: int) -> No
     assert log.reads <= 8 * PLACES
 
 
+def keyframes_of(pixels: list[int]) -> int:
+    """As the rule has it: the next one where a fifth of the view of the last one is lost."""
+    count, last = 1, pixels[0]
+    for at in pixels:
+        if abs(at - last) >= 33:
+            count, last = count + 1, at
+    return count
+
+
+@pytest.mark.parametrize(
+    ("half_px", "period", "true"),
+    [(20, 60, 1), (30, 30, 1), (25, 23, 1), (40, 60, 20)],
+    ids=["slow", "wide", "fast", "wider than a keyframe sees"],
+)
+def test_a_camera_that_turns_to_and_fro_keeps_the_keyframe_of_the_middle(
+    half_px: int, period: int, true: int
+) -> None:
+    """From where it turns back, more than a fifth of the view is lost before it turns again."""
+    phase = 2 * np.pi * np.arange(FRAMES) / period
+    pixels = np.rint(half_px * (1 + np.sin(phase))).astype(int).tolist()
+    assert keyframes_of(pixels) == true
+    found = Wall(pixels).count()
+    assert found.low <= true <= found.high
+    assert found.expected == pytest.approx(true, rel=0.1)
+
+
 def test_a_camera_that_stands_still_half_of_the_time_makes_half_as_many_less_certainly() -> None:
     moving, half = (
         Wall([3 * min(k, until) for k in range(FRAMES)]).count() for until in (FRAMES, FRAMES // 2)
