@@ -105,7 +105,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
             settle_clocks(recording, logs)
             for robot in found:
                 write_robot(
-                    recording, robot.name, logs[robot.name], robot.files, max_ratio=TRUTH_RATIO, gap=TRUTH_GAP
+                    recording, robot.name, logs[robot.name], robot.name, max_ratio=TRUTH_RATIO, gap=TRUTH_GAP
                 )
 
 

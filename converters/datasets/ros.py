@@ -217,6 +217,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
             at_depth = None if depth_ns is None else source.true_pose(pairs[stamp_ns])
             T_depth = T if at_depth is None else at_depth
             check.add(index, source.depth_m(picture), T_depth, picture.depth_sigma_m)
+    source.warnings += source.invalid_words()
     left_out.warn(source)
     readings.write_until(np.iinfo(np.int64).max)
     if not isinstance(derived, Sweeps):
@@ -232,6 +233,12 @@ def _pictures(source: RobotLog) -> Iterator[tuple[int, Picture | UnusableImage, 
     def pictured(frame: tuple[int, Any, Any]) -> tuple[int, Picture | UnusableImage, int]:
         stamp_ns, color, depth = frame
         try:
+            if isinstance(color, UnusableImage):
+                raise color
+            if isinstance(depth, UnusableImage):
+                if not source.settings.keeps_depth_time:
+                    raise depth
+                depth = None
             if derived:
                 partner_ns = source.pairs[stamp_ns]
                 assert partner_ns is not None  # or there would be nothing to derive depth from

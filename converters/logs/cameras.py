@@ -91,10 +91,10 @@ class CameraWatch:
         rest = entry.data[16:]  # in ROS what follows the times of the header, most often the same bytes
         if self._seen.get(entry.topic) == rest:
             return
-        self._seen[entry.topic] = rest
         first, rectified = self._first[entry.topic]
         where = f"{self._name}: {entry.topic}"
         now = RosCamera.of(entry.read(), rectified, where)
+        self._seen[entry.topic] = rest
         a, b = (np.array([c.camera.fx, c.camera.fy, c.camera.cx, c.camera.cy]) for c in (first, now))
         if np.abs(a - b).max() > SAME_CAMERA_PX or first.distortion != now.distortion:
             raise DuagError(

@@ -11,7 +11,7 @@ from typing import Any
 
 from duagc.converters.layouts.ros_images import DEPTH_ENCODINGS, is_depth, is_unusable
 from duagc.converters.logs.cameras import image_path
-from duagc.converters.logs.entries import LogTopic, ros_type
+from duagc.converters.logs.entries import InvalidMessage, LogTopic, ros_type
 from duagc.converters.logs.files import Log, is_below
 from duagc.converters.logs.rgbd_messages import holds_rgbd
 from duagc.converters.logs.video import is_video
@@ -79,10 +79,13 @@ class Chooser:
             wanted: topics by name of the option ("color", ...), "" = not given.
         """
         self.log, self.namespace, self._wanted = log, namespace.rstrip("/"), dict(wanted or {})
-        self.images: dict[str, Any] = {
-            t: first_usable(log, t) for t in log.of_type(*IMAGE_TYPES, below=self.namespace)
-        }
+        self.images: dict[str, Any] = {}
         self.unread = ""  # what to add to a complaint that there are no images: why others have none
+        for image_topic in log.of_type(*IMAGE_TYPES, below=self.namespace):
+            try:
+                self.images[image_topic] = first_usable(log, image_topic)
+            except InvalidMessage as error:  # and so are all others of the topic
+                self.unread += f"; {error}"
         for topic in sorted(log.topics.values(), key=lambda t: t.name):
             if topic.count and is_below(topic.name, self.namespace):
                 self._add_held(topic)
@@ -265,8 +268,8 @@ def first_usable(log: Log, topic: str) -> Any:
         topic: of images.
     """
     most = MOST_PACKETS if is_video(log.topics[topic].type) else MOST_TRIED
-    for entry in itertools.islice(log.entries(topic), most):
-        if not is_unusable(message := entry.read()):
+    for message in itertools.islice(log.messages(topic), most):
+        if not is_unusable(message):
             return message
     return log.first(topic)
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.logs.choice import IMAGE_TYPES, INFO_TYPE, POINTS_TYPE
-from duagc.converters.logs.entries import stamp_ns
+from duagc.converters.logs.entries import InvalidMessage, stamp_ns
 from duagc.converters.logs.files import Log, is_below
 from duagc.converters.logs.frames import TF_TYPES
 from duagc.converters.logs.motion import IMU_TYPE
@@ -264,7 +264,10 @@ def _times(log: Log, topics: Sequence[str]) -> Times:
     for number, entry in enumerate(log.entries(*topics) if topics else ()):
         if number >= MOST_SHARED:
             break
-        if log.topics[entry.topic].type != CLOCK_TYPE and not stamp_ns(entry.read()):
+        try:
+            if log.topics[entry.topic].type != CLOCK_TYPE and not stamp_ns(entry.read()):
+                continue
+        except InvalidMessage:  # of a topic that is not converted, perhaps
             continue
         key = entry.topic, hashlib.blake2b(entry.data, digest_size=16).digest()
         if key in found:

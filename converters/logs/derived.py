@@ -295,7 +295,7 @@ def sweeps_of(
             f"{log.name}: {topic} is of {frame!r}, and /tf_static does not tie it to {color[1].frame_id!r}; "
             "expected --set T_color_depth='x y z qw qx qy qz' of the LiDAR"
         )
-    some = [entry.read() for entry in islice(log.entries(topic), TIMED_SWEEPS)]
+    some = list(islice(log.messages(topic), TIMED_SWEEPS))
     lidar = LidarSource(T, settings.range_sigma_m, motion, PointTimes.found(some, where[1]))
     warnings = list[str]()
     if motion is None:

@@ -15,6 +15,25 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.messages.parts import NANOSECONDS
 
 LAST_NS = 1 << 62
+SOUND_TIMES = "one between the years 1970 and 2116"
+
+
+class InvalidMessage(DuagError):  # noqa: N818 (the name says it)
+    """The bytes of a message are none of its type; others of its topic may be sound.
+
+    Attributes:
+        why: what they are, without the place.
+    """
+
+    def __init__(self, where: str, why: str) -> None:
+        """Make the line of an error.
+
+        Args:
+            where: file and topic; begins the line.
+            why: what was found, and what was expected.
+        """
+        super().__init__(f"{where} {why}")
+        self.why = why
 
 
 @dataclass(frozen=True)
@@ -86,7 +105,7 @@ def sound_time(time_ns: int, where: str) -> int:
         DuagError: it is before 1970 or after 2115.
     """
     if not 0 <= time_ns < LAST_NS:
-        raise DuagError(f"{where}: time {time_ns} ns, expected one between the years 1970 and 2116")
+        raise DuagError(f"{where}: time {time_ns} ns, expected {SOUND_TIMES}")
     return time_ns
 
 
@@ -99,10 +118,14 @@ def time_of(entry: Entry, source: str, name: str) -> int:
         name: of the log.
 
     Raises:
-        DuagError: the message has no such time, or none that can be computed with.
+        InvalidMessage: the message has no header, or a time in it that cannot be computed with.
+        DuagError: the container has no times of publication.
     """
     if source == "header":
-        return sound_time(entry.header_ns(), f"{name}: {entry.topic}")
+        stamp_ns = entry.header_ns()
+        if not 0 <= stamp_ns < LAST_NS:
+            raise InvalidMessage(f"{name}: {entry.topic}", f"has time {stamp_ns} ns, expected {SOUND_TIMES}")
+        return stamp_ns
     if source == "log":
         return entry.log_ns
     if entry.publish_ns is None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.converters.logs.entries import Entry, LogPart, LogTopic
+from duagc.converters.logs.invalid import InvalidMessages
 from duagc.converters.logs.rgbd_messages import with_members
 from duagc.converters.logs.video import images, is_video
 from duagc.pipeline.base.errors import DuagError
@@ -43,6 +44,7 @@ class Log:
         """
         self.parts, self.name = list(parts), name
         self.topics: dict[str, LogTopic] = {}
+        self.invalid = InvalidMessages(self.topics)
         for part in self.parts:
             for topic in part.topics.values():
                 known = self.topics.get(topic.name)
@@ -89,19 +91,32 @@ class Log:
             )
         return _merged(streams)
 
+    def messages(self, topic: str) -> Iterator[Any]:
+        """The messages of a topic in order of recording, without those that are none.
+
+        Args:
+            topic: its name.
+        """
+        for entry in self.entries(topic):
+            message = None
+            with self.invalid.left_out(entry):
+                message = entry.read()
+            if message is not None:
+                yield message
+
     def first(self, topic: str) -> Any:
-        """The first message of a topic.
+        """The first message of a topic that is one.
 
         Args:
             topic: its name.
 
         Raises:
-            DuagError: it has no message, or the first one cannot be read.
+            DuagError: it has no message, or none can be read.
         """
-        entry = next(iter(self.entries(topic)), None)
-        if entry is None:
-            raise DuagError(f"{self.name}: {topic} has no message, expected one")
-        return entry.read()
+        message = next(self.messages(topic), None)
+        if message is None:
+            raise self.invalid.first(topic) or DuagError(f"{self.name}: {topic} has no message, expected one")
+        return message
 
 
 def _merged(streams: Sequence[Iterator[Entry]]) -> Iterator[Entry]:

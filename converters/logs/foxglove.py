@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from duagc.pipeline.base.errors import DuagError
+from duagc.converters.logs.entries import InvalidMessage
 
 ROS_TYPES = {
     "foxglove.CompressedImage": "sensor_msgs/msg/CompressedImage",
@@ -57,7 +57,7 @@ def as_ros(schema: str, message: Any, where: str) -> Any:
         message: attributes by Foxglove's names.
         where: of the message, for errors.
     Raises:
-        DuagError: a field is missing or of another kind.
+        InvalidMessage: a field is missing or of another kind.
     """
     if schema not in ROS_TYPES:
         return message
@@ -73,7 +73,7 @@ def stamp_ns(message: Any, where: str) -> int:
         where: begins the line of an error.
 
     Raises:
-        DuagError: the time cannot be read.
+        InvalidMessage: the time cannot be read.
     """
     with _readable("timestamp", where):
         stamp = _stamp(message.timestamp)
@@ -85,8 +85,8 @@ def _readable(what: str, where: str) -> Iterator[None]:
     try:
         yield
     except (AttributeError, TypeError, ValueError, KeyError, OverflowError, binascii.Error) as error:
-        raise DuagError(
-            f"{where} holds a {what} that cannot be read ({' '.join(str(error).split())})"
+        raise InvalidMessage(
+            where, f"holds a {what} that cannot be read ({' '.join(str(error).split())})"
         ) from error
 
 

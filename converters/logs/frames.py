@@ -41,6 +41,7 @@ class Transforms:
         own = [t for t in topics if is_below(t, namespace) or "/" not in t.lstrip("/")]
         self._static_topics = [t for t in own if t.endswith("tf_static")]
         self._other_topics = [t for t in own if not t.endswith("tf_static")]
+        self._topics = own
         self.moving: set[tuple[str, str]] = set()
         self._known: dict[tuple[str, str], Array] = {}
         self._broken: dict[tuple[str, str], str] = {}  # why, of those that no message states well
@@ -61,11 +62,12 @@ class Transforms:
         for topic in topics:
             unsound = Unsound()
             for entry in self._log.entries(topic):
-                for _, parent, child, T in transforms_in(entry, f"{self._log.name}: {topic}", unsound):
-                    first = found.setdefault((parent, child), T)
-                    if np.abs(first - T).max() > SAME:
-                        changed.add((parent, child))
-            self.warnings += unsound.words(topic, "transforms")
+                with self._log.invalid.left_out(entry):
+                    for _, parent, child, T in transforms_in(entry, f"{self._log.name}: {topic}", unsound):
+                        first = found.setdefault((parent, child), T)
+                        if np.abs(first - T).max() > SAME:
+                            changed.add((parent, child))
+            self.warnings += [*unsound.words(topic, "transforms"), *self._log.invalid.words([topic])]
             self._broken.update(unsound.broken)
         self._broken = {pair: why for pair, why in self._broken.items() if pair not in found}
         constant = {pair: T for pair, T in found.items() if pair not in changed}
@@ -80,7 +82,7 @@ class Transforms:
             source: frame, the same.
 
         Raises:
-            DuagError: only a transform that is none does.
+            DuagError: only a transform that is none does, or nothing does and most messages of transforms are none.
         """
         if not (frame_name(target) and frame_name(source)):
             return None
@@ -95,6 +97,8 @@ class Transforms:
             self._known = known
             if needed:
                 raise DuagError("; ".join(sorted(set(self._broken.values()))))
+        if T is None:
+            self._log.invalid.check(self._topics)
         return T
 
     def moving_words(self) -> str:

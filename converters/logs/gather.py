@@ -13,6 +13,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording.pairing import nearest_indices
 
 MOST_KEPT_BYTES = 512 << 20
+NO_TIME = -1
 
 
 def gathered(
@@ -35,7 +36,9 @@ def gathered(
     kept: dict[tuple[str, int], Entry] = {}
     at = kept_bytes = 0
     for entry in log.entries(*sorted({topic for topic, _ in uses})):
-        part = entry.topic, time_ns(entry)
+        part = entry.topic, NO_TIME
+        with log.invalid.left_out(entry):
+            part = entry.topic, time_ns(entry)
         if uses.get(part, 0) > 0 and part not in kept:
             kept[part] = entry
             kept_bytes += len(entry.data)

@@ -82,6 +82,7 @@ def look_through(
     for entry in track(entries, f"look through {PurePath(log.name).name}", total):
         for topic, take in takers:
             if topic == entry.topic:
-                take(entry)
+                with log.invalid.left_out(entry):
+                    take(entry)
     delays_ns = np.array(delays, dtype=np.int64)
     return ImageTimes(stamps, np.array(recorded, dtype=np.int64) - delays_ns, delays_ns, least_ns)

@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from duagc import schemas
 from duagc.converters.logs import foxglove, ros_json
 from duagc.converters.logs.definitions import of_ros2
-from duagc.converters.logs.entries import Entry, LogTopic, ros_type, sound_time, stamp_ns
+from duagc.converters.logs.entries import Entry, InvalidMessage, LogTopic, ros_type, sound_time, stamp_ns
 from duagc.converters.logs.mcap_chunks import Chunks
 from duagc.converters.logs.rosbag_file import (
     LARGEST_CHUNK,
@@ -335,8 +335,8 @@ class _Foxglove:
                 return foxglove.JsonFields(members if isinstance(members, dict) else {})
             return schemas.message_class(self.name).FromString(data)
         except Exception as error:  # protobuf's DecodeError, broken JSON, broken text
-            raise DuagError(
-                f"{where} holds {len(data)} bytes that are no {self.name} in {self.encoding} ({reason(error)})"
+            raise InvalidMessage(
+                where, f"holds {len(data)} bytes that are no {self.name} in {self.encoding} ({reason(error)})"
             ) from error
 
 

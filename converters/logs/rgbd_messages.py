@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
-from duagc.converters.logs.entries import Entry, LogPart, LogTopic, raw_image, stamp_ns
+from duagc.converters.logs.entries import Entry, InvalidMessage, LogPart, LogTopic, raw_image, stamp_ns
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 
@@ -62,7 +62,7 @@ class _WithMembers:
 
     def _add(self, topic: LogTopic) -> None:
         """Make the topics of the members known."""
-        message = next(iter(self._part.entries([topic.name]))).read()
+        message = self._first_sound(topic.name)
         image = "image_rect" if topic.type in _RTABMAP else "image"
         for name, member in _MEMBERS.items():
             value = getattr(message, member, None)
@@ -70,6 +70,13 @@ class _WithMembers:
             if value is not None and len(getattr(value, "data", "1")) and added not in self.topics:
                 self._source[added] = topic.name, member
                 self.topics[added] = replace(topic, name=added, type=value.__msgtype__)
+
+    def _first_sound(self, topic: str) -> Any:
+        """The first message of a topic that is one; an error if there is none."""
+        for entry in self._part.entries([topic]):
+            with suppress(InvalidMessage):
+                return entry.read()
+        raise DuagError(f"{self.path}: {topic} has no sound message, expected one")
 
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
         wanted = {name: self._source[name] for name in topics if name in self._source}

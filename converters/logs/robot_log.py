@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from duagc.converters.layouts.ros_camera import RosCamera
-from duagc.converters.layouts.ros_images import is_integer_depth, size_of
+from duagc.converters.layouts.ros_images import UnusableImage, is_integer_depth, size_of
 from duagc.converters.logs.cameras import (
     CameraWatch,
     as_stated,
@@ -21,7 +21,7 @@ from duagc.converters.logs.cameras import (
 from duagc.converters.logs.choice import Chooser
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
-from duagc.converters.logs.entries import Entry, time_of
+from duagc.converters.logs.entries import Entry, InvalidMessage, time_of
 from duagc.converters.logs.files import Log, is_own_log
 from duagc.converters.logs.frames import Transforms, frame_name
 from duagc.converters.logs.gather import gathered
@@ -154,7 +154,8 @@ class RobotLog:
         pairs = {c: d for c, d in self.pairs.items() if d is not None}
         groups = [{self.color: c, self.depth: d} for c, d in some_pairs(pairs)]
         found = gathered(self.log, groups, self.time_ns)
-        return self.derived.check([(g[self.color].read(), g[self.depth].read()) for g in found])
+        read = [(self._read(g[self.color]), self._read(g[self.depth])) for g in found]
+        return self.derived.check([p for p in read if not any(isinstance(m, UnusableImage) for m in p)])
 
     def _view(self, topic: str, option: str, chooser: Chooser) -> ImageTopic:
         """An image topic with its camera: as the options state it, else by its CameraInfo."""
@@ -276,6 +277,7 @@ class RobotLog:
         infos = [(topic, cameras.see) for topic in self._cameras]
         images = self.color, self.depth
         seen = look_through(self.log, images, self._motion.take, infos, time_ns=self.time_ns)
+        self.log.invalid.check(self._used)
         if self.settings.time_source == "header":
             least_ns = dict(seen.least_delay_ns)
             if self.settings.truth in least_ns:
@@ -350,14 +352,39 @@ class RobotLog:
         )
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
-        """Time, color and depth message (if any) of every frame, in order of time; holds no more than it must."""
+        """Time, color and depth message (if any) of every frame, in order of time; holds no more than it must.
+
+        An `UnusableImage` stands for a message that is none.
+        """
         order = sorted(self.pairs)
         wanted = [{self.color: time, self.depth: self.pairs[time]} for time in order]
         groups = [{topic: time for topic, time in group.items() if time is not None} for group in wanted]
         # to the end of the log, so that all its checksums are compared
         for index, found in enumerate(gathered(self.log, groups, self.time_ns)):
             depth = found.get(self.depth)
-            yield order[index], found[self.color].read(), None if depth is None else depth.read()
+            yield order[index], self._read(found[self.color]), None if depth is None else self._read(depth)
+
+    def _read(self, entry: Entry) -> Any:
+        """A message; why it is not usable, if it is none."""
+        try:
+            return entry.read()
+        except InvalidMessage as error:
+            self.log.invalid.add(entry, error)
+            return UnusableImage(str(error))
+
+    def invalid_words(self) -> list[str]:
+        """What to warn of: messages of the robot's topics that are none.
+
+        Raises:
+            DuagError: most messages of a topic are such.
+        """
+        self.log.invalid.check(self._used)
+        return self.log.invalid.words(self._used)
+
+    @property
+    def _used(self) -> set[str]:
+        """Topics that are converted, those of transforms apart."""
+        return {self.color, self.depth, *self._cameras, *(topic for topic, _ in self._motion.take)}
 
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from duagc.converters.logs.entries import stamp_ns
+from duagc.converters.logs.entries import InvalidMessage, stamp_ns
 from duagc.converters.logs.foxglove import Base64, json_members
 from duagc.converters.logs.rosbag_file import READ_TYPES, reason
-from duagc.pipeline.base.errors import DuagError
 
 _ALIASES = {
     "sec": ("secs",),
@@ -48,13 +47,13 @@ def read(kind: str, data: bytes, where: str) -> Any:
         where: begins the line of an error.
 
     Raises:
-        DuagError: it is no JSON, a field is missing or of another kind.
+        InvalidMessage: it is no JSON, a field is missing or of another kind.
     """
     try:
         return _built(kind, json_members(data))
     except Exception as error:  # broken JSON, and whatever values provoke that should be others
-        raise DuagError(
-            f"{where} holds {len(data)} bytes that are no {kind} in json ({reason(error)})"
+        raise InvalidMessage(
+            where, f"holds {len(data)} bytes that are no {kind} in json ({reason(error)})"
         ) from error
 
 
@@ -67,7 +66,7 @@ def header_ns(kind: str, data: bytes, where: str) -> int:
         where: begins the line of an error.
 
     Raises:
-        DuagError: as `read`.
+        InvalidMessage: as `read`.
     """
     try:
         members = json_members(data)
@@ -75,8 +74,8 @@ def header_ns(kind: str, data: bytes, where: str) -> int:
             return 0
         return stamp_ns(SimpleNamespace(header=_built("std_msgs/msg/Header", members["header"])))
     except Exception as error:
-        raise DuagError(
-            f"{where} holds {len(data)} bytes that are no {kind} in json ({reason(error)})"
+        raise InvalidMessage(
+            where, f"holds {len(data)} bytes that are no {kind} in json ({reason(error)})"
         ) from error
 
 

@@ -13,7 +13,7 @@ from urllib.parse import quote
 from duagc.converters.logs import foxglove
 from duagc.converters.logs.bag_messages import messages
 from duagc.converters.logs.definitions import of_ros2
-from duagc.converters.logs.entries import Entry, LogTopic, sound_time, stamp_ns
+from duagc.converters.logs.entries import Entry, InvalidMessage, LogTopic, sound_time, stamp_ns
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, read_text
 from duagc.pipeline.messages.parts import NANOSECONDS
@@ -28,6 +28,7 @@ _READ = {
     "tf2_msgs": "TFMessage",
 }
 READ_TYPES = {f"{package}/msg/{name}" for package, names in _READ.items() for name in names.split()}
+LONGEST_FRAME = 4096  # letters; of bytes that are no header the number is most often larger
 LARGEST_CHUNK = 256 << 20  # bytes, unpacked; recorders write some megabytes
 
 
@@ -259,12 +260,12 @@ def deserialized(read: Any, raw: bytes, kind: str, where: str) -> Any:
         where: begins the line of an error.
 
     Raises:
-        DuagError: the bytes are no message of that type.
+        InvalidMessage: the bytes are no message of that type.
     """
     try:
         return read(raw, kind)
     except Exception as error:  # whatever broken bytes provoke
-        raise DuagError(f"{where} holds {len(raw)} bytes that are no {kind} ({reason(error)})") from error
+        raise InvalidMessage(where, f"holds {len(raw)} bytes that are no {kind} ({reason(error)})") from error
 
 
 def ros_header_ns(raw: bytes, encoding: str, where: str) -> int:
@@ -276,16 +277,18 @@ def ros_header_ns(raw: bytes, encoding: str, where: str) -> int:
         where: begins the line of an error.
 
     Raises:
-        DuagError: there are too few bytes.
+        InvalidMessage: there are too few bytes, or they begin with no header.
     """
     try:
         if encoding == "cdr":
             order = "<" if raw[1] & 1 else ">"
-            seconds, nanoseconds = struct.unpack_from(f"{order}iI", raw, 4)
+            seconds, nanoseconds, letters = struct.unpack_from(f"{order}iII", raw, 4)
         else:
-            seconds, nanoseconds = struct.unpack_from("<II", raw, 4)
+            seconds, nanoseconds, letters = struct.unpack_from("<III", raw, 4)
     except (struct.error, IndexError) as error:
-        raise DuagError(f"{where} holds {len(raw)} bytes, expected a message with a header") from error
+        raise InvalidMessage(where, f"holds {len(raw)} bytes, expected a message with a header") from error
+    if letters > LONGEST_FRAME:
+        raise InvalidMessage(where, f"has a frame of {letters} letters, expected at most {LONGEST_FRAME}")
     return int(seconds) * NANOSECONDS + int(nanoseconds)
 
 

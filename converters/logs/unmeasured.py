@@ -32,9 +32,9 @@ def first_depths(
     for number, entry in enumerate(log.entries(topic)):
         if due >= EVERY * IMAGES:
             break
-        if number >= due and is_mapped(entry):
-            due += EVERY
-            with suppress(UnusableImage):
+        with suppress(UnusableImage), log.invalid.left_out(entry):
+            if number >= due and is_mapped(entry):
+                due += EVERY
                 images.append(depth_values(entry.read(), f"{log.name}: {topic}"))
     return images
 
