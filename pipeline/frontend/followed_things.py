@@ -122,18 +122,14 @@ class WeakerFeatures:
             Whether it is, and [4, 4]; None: two frames that are nearer to each other show it.
         """
         limits, (first, second) = self._config.keyframes.judgment, (self._views[k] for k in ends)
-        points = matched_features(first.features, second.features, limits)
-        agree = agreeing(*points, T_first_second, limits)
-        if np.count_nonzero(agree) < limits.min_inliers:
-            return False, None
-        view_m = min(spread_m(view.coarsest.points) for view in (first, second))
-        if spread_m(points[1][agree]) >= NARROW * view_m:
+        share = _share_of_views(first, second, T_first_second, limits)
+        if share is None or share >= NARROW:
             return False, None
         ours, theirs = (self._of(k) for k in ends)
         found = motion_spread_wider(ours, theirs, T_first_second, config=limits, rng=rng)
         if found is not None:
             return True, found.T_first_second
-        very = spread_m(points[1][agree]) < VERY_NARROW * view_m and ends[1] == ends[0] + 1
+        very = share < VERY_NARROW and ends[1] == ends[0] + 1
         return very and self.witnessed(ends[0], rng), None
 
     def witnessed(self, keyframe: int, rng: np.random.Generator) -> bool:
@@ -172,6 +168,32 @@ class WeakerFeatures:
     def _extracted(self, pyramid: RgbdPyramid) -> Features:
         limits = self._config.tracking.relocalization
         return extract_from_pyramid(pyramid, limits.max_width_px, WEAKER * limits.features)
+
+
+def fills_views(
+    first: KeyframeView, second: KeyframeView, T_first_second: Array, config: JudgmentConfig
+) -> bool:
+    """Whether the features that agree with a motion spread about as wide as the views do.
+
+    Args:
+        first: one keyframe.
+        second: another.
+        T_first_second: [4, 4], the motion.
+        config: when a match agrees with a motion, and how many must.
+    """
+    share = _share_of_views(first, second, T_first_second, config)
+    return share is not None and share >= NARROW
+
+
+def _share_of_views(
+    first: KeyframeView, second: KeyframeView, T_first_second: Array, config: JudgmentConfig
+) -> float | None:
+    """Spread of the features that agree with a motion, in that of the views; None if these are too few."""
+    points = matched_features(first.features, second.features, config)
+    agree = agreeing(*points, T_first_second, config)
+    if np.count_nonzero(agree) < config.min_inliers:
+        return None
+    return spread_m(points[1][agree]) / min(spread_m(view.coarsest.points) for view in (first, second))
 
 
 def spreads_much_wider(

@@ -5,8 +5,9 @@ it ends in a wrong minimum, and its residuals look as usual. Matched features an
 took no part in it. A pair is contradicted if features that agree on one motion are far from where the poses have them,
 or if one view stands in space that the other saw to be free. Features may be of something that moves with the camera,
 which depth does not show: where others agree with the poses, images must support the motion of those that do not. And
-poses that features confirm may follow something that moves (`followed_things`). What contradicted pairs cut off from
-the largest part of the path is not where the poses have it.
+poses that features confirm may follow something that moves (`followed_things`). Where a place repeats itself, they may
+agree on a motion that is none (`repeated_places`). What contradicted pairs cut off from the largest part of the path is
+not where the poses have it.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from duagc.pipeline.frontend.followed_things import (
     much_of_them,
     spreads_much_wider,
 )
+from duagc.pipeline.frontend.repeated_places import of_repeated_places
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -159,6 +161,7 @@ def judge(
             finding = _Finding(PairVerdict.MOVED, place) if follows else finding
         found[ends] = finding
         checkpoints.at(part, count, len(pairs), lambda: found)
+    found |= _without_repeated(found, T_map_keyframes, views, config.keyframes.judgment)
     verdicts = {ends: finding.verdict for ends, finding in found.items()}
     by_features = [
         RelativePose(*ends, finding.T_first_second, finding.information)
@@ -185,11 +188,38 @@ def judge(
 
 @dataclass(frozen=True)
 class _Finding:
-    """What is said of one pair, with the motion that features show instead; information of those that are corrected."""
+    """What is said of one pair.
+
+    Attributes:
+        verdict: on the poses.
+        T_first_second: [4, 4], the motion that features show instead.
+        information: [6, 6] of it, of those that are corrected.
+        off_rad: median angle by which features are off where they confirm the poses.
+    """
 
     verdict: PairVerdict
     T_first_second: Array | None = None
     information: Array | None = None
+    off_rad: float = 0.0
+
+
+def _without_repeated(
+    found: Mapping[Ends, _Finding],
+    T_map_keyframes: Array,
+    views: Sequence[KeyframeView],
+    config: JudgmentConfig,
+) -> dict[Ends, _Finding]:
+    """The findings that say nothing, for they come of a place that repeats itself."""
+    contradictions = {
+        ends: finding.T_first_second
+        for ends, finding in found.items()
+        if finding.verdict.contradicts and finding.T_first_second is not None
+    }
+    confirmed = {
+        ends: finding.off_rad for ends, finding in found.items() if finding.verdict is PairVerdict.CONFIRMED
+    }
+    repeated = of_repeated_places(contradictions, confirmed, T_map_keyframes, views=views, config=config)
+    return dict.fromkeys(repeated, _Finding(PairVerdict.OPEN))
 
 
 def _judged_pair(
@@ -217,7 +247,7 @@ def _judged_pair(
         return _Finding(_by_depth(first.coarsest, second.coarsest, T_first_second, config))
     if contradicted:
         return _Finding(PairVerdict.FEATURES, found.T_first_second, found.information)
-    return _Finding(PairVerdict.CONFIRMED)
+    return _Finding(PairVerdict.CONFIRMED, off_rad=found.given_rad)
 
 
 def _judged(count: int, factors: Sequence[RelativePose], config: JudgmentConfig) -> list[Ends]:
