@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from duagc.pipeline.messages.parts import NANOSECONDS
 from duagc.pipeline.recording.pairing import TOLERANCE_KEY, TOLERANCE_NS, nearest_indices
 
 LISTS = "rgb.txt", "depth.txt"
+QUATERNION = re.compile(r"\bq_?([wxyz])\b")  # components that a comment names
 
 
 class AssociationOptions(Config):
@@ -195,15 +197,20 @@ class Poses:
             path: of the file; times in seconds, positions in meters. Of one time the last pose counts.
 
         Raises:
-            DuagError: a line is not eight numbers, is too far away, or there is no pose.
+            DuagError: a line is not eight numbers, is too far away, or there is no pose; or a comment names qw before
+                qx: the angles between such poses would be right, and their axes wrong.
         """
         rows: dict[int, list[float]] = {}
         unusable = 0
         for number, line in enumerate(read_text(path, "lines of time and pose").splitlines(), start=1):
             words = line.replace(",", " ").split()
-            if not words or words[0].startswith("#"):
-                continue
             where = f"{path}:{number}"
+            if not words or words[0].startswith("#"):
+                if QUATERNION.findall(line.lower()) == ["w", "x", "y", "z"]:
+                    raise DuagError(
+                        f"{where}: names qw qx qy qz, expected time (s) x y z qx qy qz qw: put qw last in every line"
+                    )
+                continue
             try:
                 values = [float(word) for word in words[1:]]
             except ValueError:

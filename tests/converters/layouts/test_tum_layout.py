@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from duagc.converters.layouts.tum_layout import AssociationOptions, Listed, Poses, associate, read_list
+from duagc.pipeline.base.errors import DuagError
 
 
 def listed(times: list[int]) -> list[Listed]:
@@ -43,3 +44,17 @@ def test_numbers_of_poses_are_separated_by_spaces_or_commas(between: str, tmp_pa
     poses = Poses.read(path)
     assert poses.stamps_ns.tolist() == [1_000_000_001, 2_500_000_000]
     np.testing.assert_array_equal(poses.T_world_body[:, :3, 3], [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize("names", ["qw qx qy qz", "q_w, q_x, q_y, q_z"])
+def test_poses_whose_comment_names_qw_first_are_refused(names: str, tmp_path: Path) -> None:
+    """Exchanged components keep the angle between two poses: nothing but the names tells it of a short motion."""
+    path = tmp_path / "truth.txt"
+    rows = "1.0 1 2 3 0 0 0 1\n2.5 4 5 6 0 0 1 0\n"
+    path.write_text(f"# timestamp tx ty tz {names}\n{rows}")
+    with pytest.raises(
+        DuagError, match=r"truth\.txt:1: names qw qx qy qz, expected .* qx qy qz qw: put qw last"
+    ):
+        Poses.read(path)
+    path.write_text(f"# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n{rows}")
+    assert len(Poses.read(path).stamps_ns) == 2
