@@ -171,7 +171,12 @@ class Chooser:
                 if option == "depth_info" and self._wanted.get("depth_from") == "image":
                     stated += ", or registered=yes if it is seen from color"
                 return Choice("", f"{image_topic} has CameraInfo on no topic", expected=stated)
-            return Choice("", f"{image_topic} has CameraInfo on {', '.join(self.infos)}", tuple(self.infos))
+            return Choice(
+                "",
+                f"{image_topic} has CameraInfo of its own on none of {', '.join(self.infos)}",
+                tuple(self.infos),
+                f"{option}=TOPIC if one is of its camera, or {option.removesuffix('_info')}_camera='fx fy cx cy'",
+            )
         return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
 
     def _add_held(self, topic: LogTopic) -> None:

@@ -48,7 +48,7 @@ def test_numbers_of_poses_are_separated_by_spaces_or_commas(between: str, tmp_pa
 
 @pytest.mark.parametrize("names", ["qw qx qy qz", "q_w, q_x, q_y, q_z"])
 def test_poses_whose_comment_names_qw_first_are_refused(names: str, tmp_path: Path) -> None:
-    """Exchanged components keep the angle between two poses: nothing but the names tells it of a short motion."""
+    """Exchanged components keep the angle between two poses: of a short motion, only the names say it."""
     path = tmp_path / "truth.txt"
     rows = "1.0 1 2 3 0 0 0 1\n2.5 4 5 6 0 0 1 0\n"
     path.write_text(f"# timestamp tx ty tz {names}\n{rows}")

@@ -11,6 +11,7 @@ from duagc.converters.logs import open_log
 from duagc.converters.logs.cameras import is_rectified
 from duagc.converters.logs.choice import Chooser, info_parts
 from duagc.converters.logs.files import is_below
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import info
 from tests.fixtures.ros_bags import SMALL, START_NS, Ros, still
 
@@ -80,3 +81,21 @@ def test_camera_info_lies_next_to_its_images(
 @pytest.mark.parametrize("name", ["", "/", ".", "//"])
 def test_images_on_a_topic_without_a_name_are_looked_at_too(name: str) -> None:
     assert info_parts(name)[-1] == ("camera_info",)
+
+
+def test_images_without_camera_info_of_their_own_are_said_with_what_mends_them(tmp_path: Path) -> None:
+    """As of Azure Kinect's driver where only the color camera's was recorded."""
+    r = Ros(2)
+    rows = still(
+        r,
+        ("/rgb/image_raw", "c"),
+        ("/depth_to_rgb/image_raw", "c"),
+        {"/rgb/camera_info": r.info(START_NS, "c", SMALL)},
+    )
+    bag = r.write(tmp_path / "bag", rows, "mcap")
+    said = "/depth_to_rgb/image_raw has CameraInfo of its own on none of /rgb/camera_info"
+    remedy = "expected --set depth_info=TOPIC if one is of its camera, or depth_camera='fx fy cx cy'"
+    with pytest.raises(DuagError, match=f"{said}; {remedy}"):
+        registry.convert("ros", bag, tmp_path / "rec")
+    registry.convert("ros", bag, tmp_path / "rec", options=["depth_info=/rgb/camera_info"])
+    assert info(tmp_path / "rec")["robots"]["alpha"]["frames"] > 0
