@@ -36,9 +36,9 @@ class RegistrationConfig(Config):
     """Smallest estimated noise of gray values (about half a step of 8 bits)."""
     gray_sigma_of_depth: float = 0.03
     """Smallest estimated noise of gray values as a multiple of the scale of the depth noise, where the reference has
-    usual contrast; less in proportion where it has less. A camera with poor depth also has depth registered to color
-    only to a pixel, and texture turns that pixel into a gray error that is the same in all frames. With less, depth of
-    another time is not found out."""
+    usual contrast; less in proportion where it has less, and to the share of samples at whose depth noise exceeds the
+    depth gate. Poor depth is often registered to color only to a pixel, and texture turns that into a gray error that
+    is the same in all frames. With less, depth of another time is not found out."""
     gray_noise_of_depth: bool = False
     """Count the error of a sample's depth in the noise of its gray value: it shifts the sample in the target along its
     epipolar line, by pixels where the views are meters apart, and by next to nothing between following frames."""

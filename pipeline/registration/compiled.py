@@ -15,7 +15,13 @@ from duagc.pipeline.kernels import alignment
 from duagc.pipeline.registration.normal_equations import NormalEquations, SamplesSeen, System
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference, ReferenceLevel
-from duagc.pipeline.registration.residuals import GATE_SIGMAS, MAD_FROM, MAD_STRIDE, chance_between
+from duagc.pipeline.registration.residuals import (
+    GATE_SIGMAS,
+    MAD_FROM,
+    MAD_STRIDE,
+    chance_between,
+    gray_floor_of_depth,
+)
 from duagc.pipeline.registration.search import (
     ALL_DIRECTIONS,
     STEP_TOLERANCE,
@@ -131,7 +137,7 @@ def _settings(
         sigma_nearest_m=NEAREST_M,
         depth_scale_floor=config.depth_sigma_floor,
         gray_scale_floor=config.gray_sigma_floor,
-        gray_floor_of_depth=config.gray_sigma_of_depth * reference.contrast,
+        gray_floor_of_depth=gray_floor_of_depth(reference, pyramid, config),
         huber_sigmas=config.huber_sigmas,
         min_gradient=config.min_gradient,
         mad_stride=MAD_STRIDE,

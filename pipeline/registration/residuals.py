@@ -12,6 +12,9 @@ are each divided by their noise and weighted by Huber's function at a scale from
 A sample whose surface the target would see from behind has no partner: there it sees another surface, such as the
 other side of a thin wall.
 
+Depth that is poor may also be registered to color only to a pixel, so the scale of its residuals sets a floor of the
+gray noise (`gray_floor_of_depth`).
+
 An error of the depth of a sample moves q along the ray of the reference. With t the reference in the frame of the
 target and p_z the depth of the sample, the gray value that it meets has the standard deviation
 sigma_z |d gray / d q . t| / p_z, which `gray_noise_of_depth` adds to the noise of the gray residual (`_weighted`).
@@ -187,7 +190,7 @@ def linearize_at(
     depth = _depth_residuals(surface, q, m, sigma, floor=floor, pixels=(u, v), config=config)
     if not level.has_depth:
         depth = depth.nothing()
-    floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * reference.contrast * depth.scale)
+    floor = max(config.gray_sigma_floor, gray_floor_of_depth(reference, pyramid, config) * depth.scale)
     images = gray, gu, gv
     by_depth = None
     if config.gray_noise_of_depth:
@@ -227,6 +230,24 @@ def chance_between(reference: Reference, pyramid: RgbdPyramid) -> float:
     """
     sigma, other = pyramid.inverse_depth_sigma, reference.inverse_depth_sigma
     return chance_difference(sigma, sigma if other is None else other)
+
+
+def gray_floor_of_depth(reference: Reference, pyramid: RgbdPyramid, config: RegistrationConfig) -> float:
+    """Smallest noise of gray values, as a multiple of the scale of the residuals of depth.
+
+    Where noise of the inverse depth exceeds the gate of depth, that scale shows this noise alone: of what is
+    configured there is the share of the samples that lie elsewhere. Where a log states the noise, gates follow it.
+
+    Args:
+        reference: the samples; those of the coarsest level are asked.
+        pyramid: the target view.
+        config: gates, and the multiple.
+    """
+    z, share = reference.levels[-1].points[:, 2], 1.0
+    if len(z) and pyramid.levels[0].depth_sigma_m is None:
+        gate = np.maximum(config.depth_gate_m, config.depth_gate_relative * z)
+        share = float(np.mean(chance_between(reference, pyramid) * np.square(z) < gate))
+    return config.gray_sigma_of_depth * reference.contrast * share
 
 
 def _rotated(T: Floats, vectors: Floats) -> Floats:

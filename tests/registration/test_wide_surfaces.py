@@ -5,7 +5,8 @@ import numpy as np
 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.registration import Outcome, Reference, RgbdPyramid, register
+from duagc.pipeline.registration import Outcome, Reference, RegistrationConfig, RgbdPyramid, register
+from duagc.pipeline.registration.residuals import gray_floor_of_depth
 from duagc.pipeline.registration.wide_surfaces import WideSurfaces
 from tests.fixtures.room import CAMERA, pose, render
 
@@ -54,6 +55,38 @@ def test_motions_are_found_and_not_too_short_where_all_depth_is_off_by_a_tenth()
     assert len(shares) >= 12
     # no bias beyond chance; with the depth of single pixels 5 % of the motion are missing, four deviations
     assert abs(np.mean(shares) - 1) < 3 * np.std(shares) / np.sqrt(len(shares))
+
+
+def test_noise_of_depth_is_not_taken_for_noise_of_gray_values():
+    start, end = pose(z=-0.75, yaw=0.3), pose(x=0.12, z=-0.75, yaw=0.3)
+    T = se3.inverse(in_larger_room(start)) @ in_larger_room(end)
+    off = []
+    for seed in range(8):
+        reference = Reference.from_pyramid(far_view(start, 2 * seed), STRIDES)
+        result = register(reference, far_view(end, 2 * seed + 1), T)
+        off.append(np.linalg.norm(result.T_reference_target[:3, 3] - T[:3, 3]))
+    assert rms(off) < 0.02  # 0.09 where the scale of the depth residuals sets a floor of the gray noise
+
+
+def test_the_floor_of_the_gray_noise_falls_with_the_share_of_noisy_far_samples():
+    config = RegistrationConfig()
+
+    def share(pyramid: RgbdPyramid) -> float:
+        reference = Reference.from_pyramid(pyramid, STRIDES)
+        return gray_floor_of_depth(reference, pyramid, config) / (
+            config.gray_sigma_of_depth * reference.contrast
+        )
+
+    gray, depth = render(pose(yaw=0.3), noise=np.random.default_rng(0))
+    near, far = RgbdPyramid.build(gray, depth, CAMERA), far_view(pose(yaw=0.3), 0)
+    assert share(near) == 1.0
+    assert share(far) < 0.05
+    sigma = np.full_like(depth, 0.5)  # stated: the gate of depth follows it
+    assert share(RgbdPyramid.build(gray, FARTHER * depth, CAMERA, depth_sigma_m=sigma)) == 1.0
+    partly = far.levels[0].inverse_depth.copy()
+    partly[:, : CAMERA.width // 3] = 1 / 1.5  # a wall 1.5 m away
+    mixed = RgbdPyramid.build(gray, (1 / partly).astype(np.float32), CAMERA)
+    assert 0.25 < share(mixed) < 0.5
 
 
 def test_samples_lie_on_the_surfaces_and_face_as_they_do():
