@@ -146,7 +146,9 @@ def _judged(candidate: Candidate, found: GeometricVerification, config: Verifica
     closure = tentative = None
     if found.failure is None:
         information = _certainty(found.information, config)
-        closure = LoopClosure(*candidate.ends, found.T_first_second, information, alike=found.alike)
+        closure = LoopClosure(
+            *candidate.ends, found.T_first_second, information, alike=found.alike, texture=found.texture
+        )
     elif (T_features := found.features.accepted_motion) is not None:
         certainty = _certainty(found.features.information, config)
         tentative = LoopClosure(*candidate.ends, T_features, certainty)

@@ -17,9 +17,12 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends
+from duagc.pipeline.posegraph.places_alike import share_unlike
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
 CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
+MOST_UNLIKE = 0.03
+"""Share of the places that may look different to most views that show them, besides those of one spot."""
 _OTHER_GROUPS = 2  # further than the largest, that a cycle of three robots may find to be the right ones
 _SCALES = 8.0  # of a relative frame, that a placement may be off
 _ROWS = 64  # of pairs of loop closures at a time: bounds the memory
@@ -116,7 +119,8 @@ def consistent(
     Two loop closures k and l are consistent if the relative frames of the two maps that each implies agree within the
     variance of both and of both robots' odometry between them, where they overlap: that is the error of the
     cycle own k -> peer k -> peer l -> own l. A group counts only if what both views see looks alike in one of them at
-    least: it does not where one thing stands in two places.
+    least: it does not where one thing stands in two places. And few places may look different to most views that show
+    them: more do where two rooms have the same furniture.
 
     Args:
         closures: all of one pair, from the side of one end.
@@ -152,11 +156,17 @@ def consistent(
         if group.sum() < config.min_support:
             break
         left &= ~group
-        if (best := alike[group].max()) >= config.min_alike:
-            groups.append(group)
-        else:
+        agreeing = [c for c, keep in zip(closures, group.tolist(), strict=True) if keep]
+        if (best := alike[group].max()) < config.min_alike:
             unlike |= group
             differs = f"at most {best:.0%} of the common texture look alike, {config.min_alike:.0%} needed"
+        elif (share := share_unlike(agreeing, T_own[group])) > MOST_UNLIKE:
+            unlike |= group
+            differs = (
+                f"{share:.0%} of the places look different to most views, at most {MOST_UNLIKE:.0%} allowed"
+            )
+        else:
+            groups.append(group)
     if not groups:
         few = f"largest consistent group has {largest} of {m} loop closures, needs {config.min_support}"
         reasons = tuple(differs if u else few for u in unlike.tolist())

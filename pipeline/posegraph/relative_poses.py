@@ -167,6 +167,8 @@ class LoopClosure:
         information: [6, 6], right tangent (translation, rotation) of the measured motion, 1/m^2 and 1/rad^2.
         measured_from_peer: the measured motion is T_peer_own, otherwise T_own_peer.
         alike: share of the texture that both keyframes see that looks alike, known to who verified it.
+        texture: [p, 4], likewise: centers of textured parts that both see, meters, frame of the own keyframe, and 1
+            where they look alike, else 0.
     """
 
     own_keyframe: int
@@ -175,13 +177,15 @@ class LoopClosure:
     information: Array
     measured_from_peer: bool = False
     alike: float = 1.0
+    texture: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False, compare=False)
 
     def reversed(self) -> LoopClosure:
         """The same measurement from the peer's side."""
         T_peer_own = se3.inverse(self.T_own_peer)
         ends = self.peer_keyframe, self.own_keyframe
         turned = not self.measured_from_peer
-        return LoopClosure(*ends, T_peer_own, self.information, turned, alike=self.alike)
+        texture = np.column_stack([se3.transform(T_peer_own, self.texture[:, :3]), self.texture[:, 3]])
+        return LoopClosure(*ends, T_peer_own, self.information, turned, alike=self.alike, texture=texture)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from duagc.pipeline.registration.feature_motion import (
     motion_of_points,
 )
 from duagc.pipeline.registration.features import Features
-from duagc.pipeline.registration.image_agreement import share_alike
+from duagc.pipeline.registration.image_agreement import TexturedParts, textured_parts
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.rectified_features import matched_points
 from duagc.pipeline.registration.reference import Reference
@@ -76,6 +77,7 @@ class MeasuredMotion:
         T_first_second: [4, 4], by it.
         information: [6, 6] of the right tangent of T_first_second.
         shares_enough: whether the views share enough there.
+        of_first: whether the samples are of the first view.
     """
 
     reference: Reference
@@ -84,13 +86,20 @@ class MeasuredMotion:
     T_first_second: Array
     information: Array
     shares_enough: bool
+    of_first: bool
+
+    @cached_property
+    def textured(self) -> TexturedParts:
+        """Parts of the target that show texture, and whether it looks alike; centers in the first view's frame."""
+        parts = textured_parts(self.reference, self.target, self.result.T_reference_target)
+        if self.of_first:
+            return parts
+        return replace(parts, centers=se3.transform(self.T_first_second, parts.centers))
 
     @property
     def alike(self) -> float:
         """Share of the texture that both see that looks alike there; 0 where registration failed."""
-        if not self.result.ok:
-            return 0.0
-        return share_alike(self.reference, self.target, self.result.T_reference_target)
+        return self.textured.share_alike if self.result.ok else 0.0
 
 
 @dataclass(frozen=True)
@@ -124,6 +133,16 @@ class GeometricVerification:
     def alike(self) -> float:
         """Share of the texture that both views see that looks alike; 1 before the registration."""
         return min((one.alike for one in self.measured), default=1.0)
+
+    @property
+    def texture(self) -> Array:
+        """Of textured parts of what a registration lays onto each other, the center and whether both look alike.
+
+        [p, 4]: x, y, z in meters in the frame of the first view, and 1 where they look alike, else 0.
+        """
+        parts = [one.textured for one in self.measured if one.result.ok]
+        rows = [np.column_stack([of.centers, of.alike]) for of in parts]
+        return np.concatenate([np.zeros((0, 4)), *rows])
 
     @property
     def of_place(self) -> GeometricVerification:
@@ -238,14 +257,18 @@ def _registered(
         forward = register(first.reference, target, T_first_second, registration)
         enough = _shares_enough(forward, first.reference, target, config)
         T, information = forward.T_reference_target, forward.information
-        measured.append(MeasuredMotion(first.reference, target, forward, T, information, enough))
+        measured.append(
+            MeasuredMotion(first.reference, target, forward, T, information, enough, of_first=True)
+        )
     if second.reference is not None and first.images is not None:
         target = first.images()
         backward = register(second.reference, target, se3.inverse(T_first_second), registration)
         enough = _shares_enough(backward, second.reference, target, config)
         T = se3.inverse(backward.T_reference_target)
         information = se3.inverse_information(backward.T_reference_target, backward.information)
-        measured.append(MeasuredMotion(second.reference, target, backward, T, information, enough))
+        measured.append(
+            MeasuredMotion(second.reference, target, backward, T, information, enough, of_first=False)
+        )
     return measured
 
 

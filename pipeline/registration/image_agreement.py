@@ -6,6 +6,8 @@ distinguishes the rooms. Gray values are compared part by part of the image, so 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,56 @@ NOISE = 0.01  # of gray values at the coarsest level
 NEAR_PX = 5  # side of the squares within which light hardly differs, at the next to coarsest level
 
 
+@dataclass(frozen=True)
+class TexturedParts:
+    """Parts of an image that show a texture, in it or in another view that it was laid onto.
+
+    Attributes:
+        centers: [p, 3], of what they show, meters, in the frame of the other view.
+        samples: int [p], how many of the other view they hold.
+        alike: bool [p], whether both views look alike there.
+    """
+
+    centers: Array
+    samples: NDArray[np.int64]
+    alike: NDArray[np.bool_]
+
+    @property
+    def share_alike(self) -> float:
+        """Share of the samples in parts that look alike; 1 where too little texture is seen by both to decide."""
+        if len(self.samples) < MIN_PARTS:
+            return 1.0
+        return float(self.samples[self.alike].sum() / self.samples.sum())
+
+
+def textured_parts(reference: Reference, target: RgbdPyramid, T_reference_target: Array) -> TexturedParts:
+    """The parts of the target's image that show texture, and whether it looks alike in both views.
+
+    Args:
+        reference: samples of one view.
+        target: the other view.
+        T_reference_target: [4, 4], where registration has the target.
+    """
+    level = target.levels[-1]
+    index, seen, row, column = _shared(reference, target, T_reference_target, len(target.levels) - 1)
+    samples = reference.levels[-1]
+    given, points = samples.intensities[index].astype(np.float64), samples.points[index].astype(np.float64)
+    rows, columns = PARTS
+    part = (row * rows // level.camera.height) * columns + column * columns // level.camera.width
+    count = np.bincount(part, minlength=rows * columns)
+    some = np.maximum(count, 1)
+
+    def mean(values: Array) -> Array:
+        return np.bincount(part, values, minlength=len(count)) / some
+
+    a, b = given - mean(given)[part], seen - mean(seen)[part]
+    deviations = np.sqrt(mean(a * a)), np.sqrt(mean(b * b))
+    textured = (count >= MIN_SAMPLES) & (np.maximum(*deviations) >= MIN_CONTRAST)
+    correlation = mean(a * b) / (deviations[0] * deviations[1] + NOISE**2)
+    centers = np.stack([mean(axis) for axis in points.T], axis=1)
+    return TexturedParts(centers[textured], count[textured], correlation[textured] > MIN_CORRELATION)
+
+
 def share_alike(reference: Reference, target: RgbdPyramid, T_reference_target: Array) -> float:
     """Share of the samples in textured parts of the target's image whose parts look alike in both views.
 
@@ -35,11 +87,7 @@ def share_alike(reference: Reference, target: RgbdPyramid, T_reference_target: A
     Returns:
         0 to 1; 1 where too little texture is seen by both to decide.
     """
-    level = target.levels[-1]
-    given, seen, row, column = _shared(reference, target, T_reference_target, len(target.levels) - 1)
-    rows, columns = PARTS
-    part = (row * rows // level.camera.height) * columns + column * columns // level.camera.width
-    return _share(part, given, seen)
+    return textured_parts(reference, target, T_reference_target).share_alike
 
 
 def same_under_other_light(
@@ -58,9 +106,10 @@ def same_under_other_light(
         min_samples: fewer that both see decide against it.
     """
     index = max(len(target.levels) - 2, 0)
-    given, seen, row, column = _shared(reference, target, T_reference_target, index)
-    if len(given) < min_samples:
+    sample, seen, row, column = _shared(reference, target, T_reference_target, index)
+    if len(sample) < min_samples:
         return False
+    given = reference.levels[index].intensities[sample].astype(np.float64)
     columns = target.levels[index].camera.width // NEAR_PX + 1
     part = (row // NEAR_PX) * columns + column // NEAR_PX
     count = np.maximum(np.bincount(part), 1)
@@ -70,8 +119,8 @@ def same_under_other_light(
 
 def _shared(
     reference: Reference, target: RgbdPyramid, T_reference_target: Array, index: int
-) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Gray values [n] of the samples that a target sees on the same surface, its own there, and rows and columns."""
+) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Samples [n] that a target sees on the same surface, its gray values there, and rows and columns."""
     level, samples = target.levels[index], reference.levels[index]
     points = se3.transform(se3.inverse(T_reference_target), samples.points.astype(np.float64))
     seen, column, row = visible(level.camera, points, margin_px=1)
@@ -81,21 +130,4 @@ def _shared(
         same &= np.abs(points[seen, 2] * inverse - 1) < SAME_SURFACE
     seen, column, row = seen[same], column[same], row[same]
     gray = bilinear(level.gray, *level.camera.project(points[seen]).T).astype(np.float64)
-    return samples.intensities[seen].astype(np.float64), gray, row, column
-
-
-def _share(part: NDArray[np.int64], given: Array, seen: Array) -> float:
-    """Share of the samples of textured parts that correlate, by the part [n] of each and its gray values [n]."""
-    count = np.bincount(part, minlength=PARTS[0] * PARTS[1])
-    some = np.maximum(count, 1)
-
-    def mean(values: Array) -> Array:
-        return np.bincount(part, values, minlength=len(count)) / some
-
-    a, b = given - mean(given)[part], seen - mean(seen)[part]
-    deviations = np.sqrt(mean(a * a)), np.sqrt(mean(b * b))
-    textured = (count >= MIN_SAMPLES) & (np.maximum(*deviations) >= MIN_CONTRAST)
-    if np.count_nonzero(textured) < MIN_PARTS:
-        return 1.0
-    correlation = mean(a * b) / (deviations[0] * deviations[1] + NOISE**2)
-    return float(count[textured & (correlation > MIN_CORRELATION)].sum() / count[textured].sum())
+    return seen, gray, row, column

@@ -12,7 +12,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.registration import Reference, RgbdPyramid
 from duagc.pipeline.registration.features import extract
 from duagc.pipeline.registration.geometric_verification import VerificationView, verify
-from duagc.pipeline.registration.image_agreement import share_alike
+from duagc.pipeline.registration.image_agreement import share_alike, textured_parts
 
 MIN_ALIKE = LoopClosureConfig().min_alike
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -44,6 +44,20 @@ def test_a_poster_on_another_wall_is_another_place() -> None:
     one, other = wall(1), wall(2)
     one[POSTER] = other[POSTER] = wall(3)[POSTER]
     assert share(one, other) < MIN_ALIKE
+
+
+def test_parts_are_known_by_their_places_on_the_surface() -> None:
+    one, other = wall(1), wall(2)
+    one[POSTER] = other[POSTER] = wall(3)[POSTER]
+    T = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    shifted = np.roll(other, -13, axis=1)  # 0.1 m at 2 m
+    parts = textured_parts(Reference.sample(view(one)), view(shifted), T)
+    pixels = CAMERA.project(parts.centers)
+    np.testing.assert_allclose(parts.centers[:, 2], 2.0, atol=1e-6)
+    inside = (np.abs(pixels - [160, 120]) < 35).all(axis=1)
+    outside = (np.abs(pixels - [160, 120]) > 75).any(axis=1)
+    assert parts.alike[inside].all()
+    assert parts.alike[outside].mean() < 0.2
 
 
 def test_views_of_a_poster_on_another_wall_are_verified_as_unlike() -> None:
