@@ -188,12 +188,16 @@ def fills_views(
 def _share_of_views(
     first: KeyframeView, second: KeyframeView, T_first_second: Array, config: JudgmentConfig
 ) -> float | None:
-    """Spread of the features that agree with a motion, in that of the views; None if these are too few."""
+    """Spread of the features that agree with a motion, in that of the views.
+
+    None if these are too few, or the coarsest image of a view has too little depth to know.
+    """
     points = matched_features(first.features, second.features, config)
     agree = agreeing(*points, T_first_second, config)
     if np.count_nonzero(agree) < config.min_inliers:
         return None
-    return spread_m(points[1][agree]) / min(spread_m(view.coarsest.points) for view in (first, second))
+    view_m = min(spread_m(view.coarsest.points) for view in (first, second))
+    return spread_m(points[1][agree]) / view_m if view_m > 0 else None
 
 
 def spreads_much_wider(

@@ -167,8 +167,8 @@ def _verified(
         verified = verify(view(one), view(other), limits, registration=registration, rng=rng, both=True)
         place, moved = verified.of_place, verified.of_moved
         if place.failure is None:
-            look = {"alike": place.alike, "texture": place.texture}
-            closures.append(LoopClosure(i, j, place.T_first_second, place.information, **look))
+            T, information = place.T_first_second, place.information
+            closures.append(LoopClosure(i, j, T, information, alike=place.alike, texture=place.texture))
         if (T_features := place.features.accepted_motion) is None:
             continue
         by_features = LoopClosure(i, j, T_features, place.features.information)

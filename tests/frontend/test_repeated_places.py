@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.experiments.disturbed_tracking import Undisturbed
+from duagc.pipeline.frontend.followed_things import fills_views
 from duagc.pipeline.frontend.judgment import Judgment, PairVerdict, judge
 from duagc.pipeline.frontend.repeated_places import Ends, of_repeated_places
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
@@ -92,3 +93,13 @@ def test_pairs_between_exclude_what_they_cannot_add_up_to(
     between = {(i, j): 0.001 for j in range(COUNT) for i in (j - 2, j - 1) if 0 <= i < confirmed}
     limits = CONFIG.keyframes.judgment
     assert of_repeated_places({ENDS: T_other}, between, POSES, views=views, config=limits) == repeated
+
+
+def test_a_view_without_depth_in_its_coarsest_image_is_not_known_to_be_filled(run: Undisturbed) -> None:
+    first, second = views_of(run, T_TRUE)[:2]
+    T = se3.inverse(POSES[0]) @ POSES[1]
+    assert fills_views(first, second, T, CONFIG.keyframes.judgment)
+    coarsest = second.coarsest
+    empty = replace(coarsest, inverse_depth=np.zeros_like(coarsest.inverse_depth))
+    second = replace(second, coarsest=empty)
+    assert not fills_views(first, second, T, CONFIG.keyframes.judgment)
