@@ -21,7 +21,7 @@ from duagc.pipeline.posegraph.places_alike import share_unlike
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
 CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
-MOST_UNLIKE = 0.03
+MOST_UNLIKE = 0.06
 """Share of the places that may look different to most views that show them, besides those of one spot."""
 _OTHER_GROUPS = 2  # further than the largest, that a cycle of three robots may find to be the right ones
 _SCALES = 8.0  # of a relative frame, that a placement may be off
@@ -163,7 +163,7 @@ def consistent(
         elif (share := share_unlike(agreeing, T_own[group])) > MOST_UNLIKE:
             unlike |= group
             differs = (
-                f"{share:.0%} of the places look different to most views, at most {MOST_UNLIKE:.0%} allowed"
+                f"{share:.1%} of the places look different to most views, at most {MOST_UNLIKE:.0%} allowed"
             )
         else:
             groups.append(group)

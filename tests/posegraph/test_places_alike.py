@@ -15,7 +15,7 @@ VIEWS = 6
 T_OWN = np.array([se3.exp([0.1 * k, 0.0, 0.0, 0.0, 0.05 * k, 0.0]) for k in range(VIEWS)])
 WALL = np.stack([*np.meshgrid(np.arange(-5, 6) * 0.6, np.arange(-3, 4) * 0.6, indexing="ij")], axis=-1)
 POINTS = np.insert(WALL.reshape(-1, 2), 2, 3.0, axis=1) + 0.2  # 77 places on a wall 3 m ahead
-SPOTS = ([0, 1, 7, 8], [35], [75, 76])
+SPOTS = ([0, 1, 7, 8], [35], [56, 57], [75, 76])
 ALL = [place for spot in SPOTS for place in spot]
 
 
@@ -34,7 +34,7 @@ def closures(unlike: list[int], *, votes: int = VIEWS, points: np.ndarray = POIN
 def test_places_that_look_different_count_but_for_the_largest_spot() -> None:
     assert share_unlike(closures([]), T_OWN) == 0
     assert share_unlike(closures(SPOTS[0]), T_OWN) == 0
-    assert share_unlike(closures(ALL), T_OWN) == pytest.approx(3 / len(POINTS))
+    assert share_unlike(closures(ALL), T_OWN) == pytest.approx(5 / len(POINTS))
 
 
 def test_most_views_decide_and_few_places_decide_nothing() -> None:
@@ -56,7 +56,7 @@ def test_robots_in_two_rooms_with_the_same_furniture_are_not_joined(unlike: list
         return
     assert joined.T_ownmap_peermap is None
     assert joined.unlike.all()
-    assert joined.reasons[0] == "4% of the places look different to most views, at most 3% allowed"
+    assert joined.reasons[0] == "6.5% of the places look different to most views, at most 6% allowed"
 
 
 def test_the_other_end_of_a_loop_closure_knows_the_same_places() -> None:
