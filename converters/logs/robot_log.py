@@ -278,6 +278,9 @@ class RobotLog:
         images = self.color, self.depth
         seen = look_through(self.log, images, self._motion.take, infos, time_ns=self.time_ns)
         self.log.invalid.check(self._used)
+        for topic, times in seen.by_topic.items():
+            if not times and (error := self.log.invalid.first(topic)):
+                raise error
         if self.settings.time_source == "header":
             least_ns = dict(seen.least_delay_ns)
             if self.settings.truth in least_ns:
