@@ -56,10 +56,10 @@ def textured_parts(reference: Reference, target: RgbdPyramid, T_reference_target
         target: the other view.
         T_reference_target: [4, 4], where registration has the target.
     """
-    level = target.levels[-1]
-    index, seen, row, column = _shared(reference, target, T_reference_target, len(target.levels) - 1)
-    samples = reference.levels[-1]
-    given, points = samples.intensities[index].astype(np.float64), samples.points[index].astype(np.float64)
+    index = len(target.levels) - 1
+    level, samples = target.levels[index], reference.levels[index]
+    at, seen, row, column = _shared(reference, target, T_reference_target, index)
+    given, points = samples.intensities[at].astype(np.float64), samples.points[at].astype(np.float64)
     rows, columns = PARTS
     part = (row * rows // level.camera.height) * columns + column * columns // level.camera.width
     count = np.bincount(part, minlength=rows * columns)
@@ -106,10 +106,10 @@ def same_under_other_light(
         min_samples: fewer that both see decide against it.
     """
     index = max(len(target.levels) - 2, 0)
-    sample, seen, row, column = _shared(reference, target, T_reference_target, index)
-    if len(sample) < min_samples:
+    at, seen, row, column = _shared(reference, target, T_reference_target, index)
+    if len(at) < min_samples:
         return False
-    given = reference.levels[index].intensities[sample].astype(np.float64)
+    given = reference.levels[index].intensities[at].astype(np.float64)
     columns = target.levels[index].camera.width // NEAR_PX + 1
     part = (row // NEAR_PX) * columns + column // NEAR_PX
     count = np.maximum(np.bincount(part), 1)

@@ -102,3 +102,10 @@ def test_texture_that_one_view_alone_shows_is_a_difference(textured_first: bool)
 def test_without_depth_gray_values_are_compared() -> None:
     reference = Reference.sample(view(wall(1)))
     assert share_alike(reference, view(wall(1)).without_depth(), np.eye(4)) == 1.0
+
+
+def test_a_reference_may_have_more_levels_than_the_other_view() -> None:
+    more = RgbdPyramid.build(wall(1), np.full(wall(1).shape, 2.0, np.float32), CAMERA, 4)
+    reference = Reference.from_pyramid(more, (4, 2, 1, 1))
+    assert share_alike(reference, view(wall(1)), np.eye(4)) == 1.0
+    assert share_alike(reference, view(wall(2)), np.eye(4)) < 0.1
