@@ -15,7 +15,10 @@ from duagc.pipeline.messages.parts import NANOSECONDS
 
 
 class InvalidMessages:
-    """What was left out of a log, by topic and time of recording; messages that are read twice count once."""
+    """What was left out of a log, by topic and time of recording.
+
+    What is read twice counts once, and so do messages of one topic that were recorded at one time.
+    """
 
     def __init__(self, topics: Mapping[str, LogTopic]) -> None:
         """Nothing was left out yet.

@@ -278,7 +278,7 @@ class RobotLog:
         images = self.color, self.depth
         seen = look_through(self.log, images, self._motion.take, infos, time_ns=self.time_ns)
         self.log.invalid.check(self._used)
-        for topic, times in seen.by_topic.items():
+        for topic, times in seen.by_topic.items():  # messages of one time of recording were counted as one
             if not times and (error := self.log.invalid.first(topic)):
                 raise error
         if self.settings.time_source == "header":

@@ -8,6 +8,7 @@ What moves in the place never fills the views: of what follows that, each pair i
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -42,25 +43,31 @@ def of_repeated_places(
     def motion_between(first: int, second: int) -> Array:
         return se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
 
-    off_rad = {
-        ends: max(rad, config.max_angle_rad)
-        for ends, rad in confirmed.items()
-        if fills_views(views[ends[0]], views[ends[1]], motion_between(*ends), config)
-    }
+    ways: dict[int, list[tuple[int, float]]] = defaultdict(list)
+    for (i, j), rad in confirmed.items():
+        between = any(first <= i and j <= last for first, last in contradictions)
+        if between and fills_views(views[i], views[j], motion_between(i, j), config):
+            ways[j].append((i, max(rad, config.max_angle_rad)))
     out = set()
     for (first, second), T_other in contradictions.items():
         moved_m, turned_rad = se3.distance(T_other, motion_between(first, second))
         apart_rad = moved_m / float(np.median(views[first].features.points[:, 2])) + turned_rad
-        if apart_rad > _least_off_rad(first, second, off_rad):
+        if apart_rad > _least_off_rad(first, second, ways):
             out.add((first, second))
     return out
 
 
-def _least_off_rad(first: int, last: int, off_rad: Mapping[Ends, float]) -> float:
-    """Angle by which the surest way from one keyframe forward to a later one is off at most; infinite without one."""
-    least = {first: 0.0}
+def _least_off_rad(first: int, last: int, ways: Mapping[int, Sequence[tuple[int, float]]]) -> float:
+    """Angle by which the surest way from one keyframe forward to a later one is off at most; infinite without one.
+
+    Args:
+        first: the one keyframe.
+        last: the later one.
+        ways: to each keyframe: from which earlier ones pairs lead, and the angle by which each is off at most, rad.
+    """
+    least_rad = {first: 0.0}
     for k in range(first + 1, last + 1):
-        ways = [least[i] + rad for (i, j), rad in off_rad.items() if j == k and i in least]
-        if ways:
-            least[k] = min(ways)
-    return least.get(last, np.inf)
+        found = [least_rad[i] + rad for i, rad in ways.get(k, ()) if i in least_rad]
+        if found:
+            least_rad[k] = min(found)
+    return least_rad.get(last, np.inf)

@@ -12,9 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial.distance import cdist
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
@@ -55,7 +52,13 @@ def share_unlike(closures: Sequence[LoopClosure], T_own: Array) -> float:
 
 def _spots(places: NDArray[np.int64]) -> NDArray[np.int64]:
     """Numbers of places in each group of places [n, 3] that touch each other."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
     if not len(places):
         return np.zeros(0, dtype=np.int64)
-    _, spot_of = connected_components(csr_array(cdist(places, places, "chebyshev") <= 1), directed=False)
+    i, j = cKDTree(places).query_pairs(1.0, p=np.inf, output_type="ndarray").T
+    touching = coo_array((np.ones(len(i)), (i, j)), shape=(len(places), len(places)))
+    _, spot_of = connected_components(touching, directed=False)
     return np.bincount(spot_of)

@@ -76,20 +76,6 @@ def textured_parts(reference: Reference, target: RgbdPyramid, T_reference_target
     return TexturedParts(centers[textured], count[textured], correlation[textured] > MIN_CORRELATION)
 
 
-def share_alike(reference: Reference, target: RgbdPyramid, T_reference_target: Array) -> float:
-    """Share of the samples in textured parts of the target's image whose parts look alike in both views.
-
-    Args:
-        reference: samples of one view.
-        target: the other view.
-        T_reference_target: [4, 4], where registration has the target.
-
-    Returns:
-        0 to 1; 1 where too little texture is seen by both to decide.
-    """
-    return textured_parts(reference, target, T_reference_target).share_alike
-
-
 def same_under_other_light(
     reference: Reference, target: RgbdPyramid, T_reference_target: Array, *, min_samples: int
 ) -> bool:

@@ -12,7 +12,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.registration import Reference, RgbdPyramid
 from duagc.pipeline.registration.features import extract
 from duagc.pipeline.registration.geometric_verification import VerificationView, verify
-from duagc.pipeline.registration.image_agreement import share_alike, textured_parts
+from duagc.pipeline.registration.image_agreement import textured_parts
 
 MIN_ALIKE = LoopClosureConfig().min_alike
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -31,7 +31,7 @@ def view(gray: np.ndarray) -> RgbdPyramid:
 
 
 def share(gray: np.ndarray, other: np.ndarray) -> float:
-    return share_alike(Reference.sample(view(gray)), view(other), np.eye(4))
+    return textured_parts(Reference.sample(view(gray)), view(other), np.eye(4)).share_alike
 
 
 def test_a_place_looks_like_itself_in_any_light() -> None:
@@ -90,7 +90,7 @@ def test_a_place_where_less_than_half_changed_looks_like_itself() -> None:
 def test_without_texture_nothing_is_decided() -> None:
     assert share(wall(1, contrast=0.001), wall(2, contrast=0.001)) == 1.0
     away = se3.exp(np.array([50.0, 0, 0, 0, 0, 0]))
-    assert share_alike(Reference.sample(view(wall(1))), view(wall(1)), away) == 1.0
+    assert textured_parts(Reference.sample(view(wall(1))), view(wall(1)), away).share_alike == 1.0
 
 
 @pytest.mark.parametrize("textured_first", [True, False])
@@ -101,11 +101,11 @@ def test_texture_that_one_view_alone_shows_is_a_difference(textured_first: bool)
 
 def test_without_depth_gray_values_are_compared() -> None:
     reference = Reference.sample(view(wall(1)))
-    assert share_alike(reference, view(wall(1)).without_depth(), np.eye(4)) == 1.0
+    assert textured_parts(reference, view(wall(1)).without_depth(), np.eye(4)).share_alike == 1.0
 
 
 def test_a_reference_may_have_more_levels_than_the_other_view() -> None:
     more = RgbdPyramid.build(wall(1), np.full(wall(1).shape, 2.0, np.float32), CAMERA, 4)
     reference = Reference.from_pyramid(more, (4, 2, 1, 1))
-    assert share_alike(reference, view(wall(1)), np.eye(4)) == 1.0
-    assert share_alike(reference, view(wall(2)), np.eye(4)) < 0.1
+    assert textured_parts(reference, view(wall(1)), np.eye(4)).share_alike == 1.0
+    assert textured_parts(reference, view(wall(2)), np.eye(4)).share_alike < 0.1
