@@ -197,7 +197,9 @@ def _open_window(rrd: Path) -> None:
         DuagError: there is no viewer, or it could not open a window.
     """
     command = [_executable(), *_served(_free_port())]
-    done = subprocess.run([*command, str(rrd)], check=False, stderr=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [*command, str(rrd)], check=False, stderr=subprocess.PIPE, text=True, errors="replace"
+    )
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         raise DuagError(
@@ -237,7 +239,7 @@ def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
             data = _picture(viewer, port, rrd, time.monotonic() + timeout_s)
         except Exception as error:  # the client raises RuntimeError and its own kinds
             said.seek(0)
-            why = _last_words(said.read().decode(errors="replace"), str(error) or type(error).__name__)
+            why = _last_words(said.read().decode(errors="replace"), error)
             raise DuagError(
                 f"{png}: the viewer drew no picture ({why}); it needs a graphics driver, "
                 "for example the package mesa-vulkan-drivers"
@@ -268,10 +270,12 @@ def _picture(viewer: subprocess.Popen[bytes], port: int, rrd: Path, end_s: float
     return _settled_picture(client, end_s)
 
 
-def _last_words(said: str, otherwise: str) -> str:
-    """Why a viewer ended: of what it said the line of its panic, else the first line of another text."""
-    lines = [line.strip() for line in said.splitlines() if "panicked at" in line]
-    return lines[0] if lines else otherwise.strip().splitlines()[0]
+def _last_words(said: str, error: Exception) -> str:
+    """Why a viewer ended: of what it said the line of its panic, else the first line of an error, or what it is."""
+    panics = [line.strip() for line in said.splitlines() if "panicked at" in line]
+    return next(
+        (line for line in (*panics, *map(str.strip, str(error).splitlines())) if line), type(error).__name__
+    )
 
 
 def _settled_picture(viewer: Any, end_s: float) -> bytes:

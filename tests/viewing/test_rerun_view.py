@@ -236,6 +236,35 @@ def test_a_viewer_that_is_silent_is_named_by_how_it_ended(fake, tmp_path, monkey
         rerun_view.view(fake.recording, screenshot=tmp_path / "out.png")
 
 
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("", "OSError"),
+        (" \n", "OSError"),
+        ("\n no port \nat all", "no port"),
+    ],
+)
+def test_an_error_of_the_client_is_named_by_its_first_word_or_its_kind(
+    fake, tmp_path, monkeypatch, said, words
+):
+    def fail(*_):
+        raise OSError(said)
+
+    monkeypatch.setattr(rerun_view, "_executable", lambda: "/bin/true")
+    monkeypatch.setattr(rerun_view, "_picture", fail)
+    with pytest.raises(DuagError, match=rf"drew no picture \({words}\)"):
+        rerun_view.take_screenshot(fake.recording, tmp_path / "out.png")
+
+
+def test_a_viewer_whose_words_are_no_text_is_an_error_all_the_same(fake, tmp_path, monkeypatch):
+    viewer = tmp_path / "viewer"
+    viewer.write_text("#!/bin/sh\nprintf 'no display \\377\\n' >&2\nexit 1\n")
+    viewer.chmod(0o755)
+    monkeypatch.setattr(rerun_view, "_executable", lambda: str(viewer))
+    with pytest.raises(DuagError, match=r"the viewer ended with 1 \(no display .*--save"):
+        rerun_view.view(fake.recording)
+
+
 def test_a_window_that_does_not_open_is_an_error(fake, monkeypatch):
     import subprocess
 
