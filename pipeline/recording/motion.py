@@ -131,12 +131,12 @@ class GyroPrior:
         return np.asarray(R[-1].T @ R[:-1])
 
     def _used(self, start_ns: int, stop_ns: int) -> slice | None:
-        """The rates from one time to another."""
+        """The rates from the last one at or before a time to the first one at or after another."""
         stamps = self.stamps_ns
-        first, last = (int(np.searchsorted(stamps, t)) for t in (start_ns, stop_ns))
         if len(stamps) < 2 or start_ns < stamps[0] or stop_ns > stamps[-1]:
             return None
-        used = slice(max(first - 1, 0), last + 1)
+        first, last = np.searchsorted(stamps, start_ns, side="right") - 1, np.searchsorted(stamps, stop_ns)
+        used = slice(int(first), int(last) + 1)
         return None if np.any(np.diff(stamps[used]) > LONGEST_RATE_GAP_NS) else used
 
     def _edges(self, used: slice, start_ns: int, stop_ns: int) -> NDArray[np.int64]:

@@ -78,3 +78,17 @@ def test_gyro_prior_turns_as_the_camera_does(tmp_path: Path) -> None:
     assert prior.turns(411_000_000, np.array([700_000_000]), GyroCorrection()) is None
     with pytest.raises(DuagError, match="/alpha/imu/transform has no message"):
         open_rgbd(write(False)).motion_prior()
+
+
+def test_a_gap_that_ends_where_a_motion_begins_leaves_it_known():
+    """A rate is measured when the motion begins, so that it needs nothing of the gap before."""
+    stamps = [0, 100_000_000, 120_000_000, 140_000_000, 240_000_000]
+    prior = GyroPrior(stamps, np.tile([0.0, 1.0, 0.0], (len(stamps), 1)))
+    motion = prior.between(100_000_000, 140_000_000)
+    assert motion is not None
+    np.testing.assert_allclose(motion.T_start_stop, se3.exp([0, 0, 0, 0, 0.04, 0]), atol=1e-12)
+    turns = prior.turns(100_000_000, np.array([120_000_000, 140_000_000]), GyroCorrection())
+    assert turns is not None
+    np.testing.assert_allclose(turns[1], motion.T_start_stop[:3, :3], atol=1e-12)
+    assert prior.between(99_999_999, 140_000_000) is None
+    assert prior.between(100_000_000, 140_000_001) is None
