@@ -14,6 +14,7 @@ import numpy as np
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.current_frame import CurrentFrame, PoseCandidate
+from duagc.pipeline.frontend.depth_quality import largest_depth_offset_s
 from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
 from duagc.pipeline.frontend.submaps import TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
@@ -28,7 +29,13 @@ class _Backward(Tracker):
     """Follows frames in reverse order, at times before the first keyframe as if they came after it."""
 
     def __init__(
-        self, camera: PinholeCamera, keyframe: TrackedKeyframe, first: RgbdFrame, config: FrontendConfig
+        self,
+        camera: PinholeCamera,
+        keyframe: TrackedKeyframe,
+        first: RgbdFrame,
+        config: FrontendConfig,
+        *,
+        max_depth_offset_s: float,
     ) -> None:
         """Start at the first keyframe.
 
@@ -37,8 +44,9 @@ class _Backward(Tracker):
             keyframe: the first one.
             first: its frame.
             config: of the front end.
+            max_depth_offset_s: as of `Tracker`.
         """
-        super().__init__(camera, config)
+        super().__init__(camera, config, max_depth_offset_s=max_depth_offset_s)
         state, strides = self.state, config.tracking.strides
         state.keyframes.append(keyframe)
         pyramid = pyramid_of(first, camera, len(strides))
@@ -86,7 +94,9 @@ def track_leading_frames(log: RgbdLog, tracked: TrackedLog, config: FrontendConf
     leading = [k for k, frame in enumerate(frames) if frame.frame_index < start.frame_index]
     if not leading:
         return tracked
-    backward = _Backward(log.camera, start, log.frame(start.frame_index), config)
+    limit_s = largest_depth_offset_s(log.pairing.pairs, config.keyframes.max_depth_offset_s)
+    first = log.frame(start.frame_index)
+    backward = _Backward(log.camera, start, first, config, max_depth_offset_s=limit_s)
     backward.start_from(
         [f for f, n in zip(frames, submap_of, strict=True) if n == submap.number], start.frame_index
     )

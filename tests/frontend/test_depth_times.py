@@ -9,7 +9,10 @@ import pytest
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.held_out import is_held_out
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
+from duagc.pipeline.frontend import leading_frames
+from duagc.pipeline.frontend.current_frame import CurrentFrame
 from duagc.pipeline.frontend.depth_quality import largest_depth_offset_s
+from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import read_log
@@ -108,11 +111,12 @@ def test_a_frame_that_was_found_afterwards_has_its_depth_moved(tmp_path: Path) -
     assert se3.distance(T_found, se3.inverse(walk(21)) @ walk(20))[0] < 0.001
 
 
-def slow_log(folder: Path, late_ns: int, stated: bool, frames: int) -> Path:
-    """Ten images a second; depth is always taken some time after them."""
+def slow_log(folder: Path, late_ns: int, stated: bool, frames: int, *, sparse: int = 0) -> Path:
+    """Ten images a second; depth is always taken some time after them, of the first few in a few rows."""
     with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
         for k in range(frames):
             gray, depth_m = render(walk(3 * k))[0], render(walk(3 * (k + late_ns / 1e8)))[1]
+            depth_m[3 if k < sparse else len(depth_m) :] = 0
             image = np.repeat(np.rint(np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2)
             stamp_ns = k * 100_000_000
             robot.add_frame(
@@ -132,6 +136,22 @@ def test_depth_that_is_never_near_in_time_makes_a_map(tmp_path: Path) -> None:
     for k, found in enumerate(frames):
         T_true = se3.inverse(walk(0)) @ walk(3 * k)
         assert se3.distance(T_first @ found.T_map_camera, T_true)[0] < 0.01
+
+
+def test_frames_before_the_first_keyframe_have_depth_as_near_as_their_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near: list[bool] = []
+    prepared = leading_frames._Backward.prepared
+
+    def asked(tracker: leading_frames._Backward, images: RgbdImages) -> CurrentFrame:
+        near.append(tracker._is_near(images.depth_offset_ns))
+        return prepared(tracker, images)
+
+    monkeypatch.setattr(leading_frames._Backward, "prepared", asked)
+    frames = tracked(slow_log(tmp_path / "rec", 40_000_000, stated=True, frames=4, sparse=1))
+    assert [f.status for f in frames] == ["ok"] * 4
+    assert near == [True]
 
 
 def test_how_near_depth_must_be_is_by_the_log() -> None:
