@@ -55,7 +55,8 @@ SHORT_PERCENTILE = 10  # of the times between images
 MOVED_FRAMES = 20  # by which it is known how far rows move
 MOST_ROUNDS = 4
 SETTLED = 0.25  # of the readout, at most, found in the last round
-TYPICAL = 0.5  # quantile of the changes of velocity, where those of the largest cannot be registered
+LARGEST = 1.0  # quantile of the changes of velocity
+TYPICAL = 0.5  # the same where views of the largest change cannot be registered
 LEAST_POINTS = 50  # of a half that both frames see
 
 
@@ -93,23 +94,23 @@ def certain_readout(frames: FramePairs, config: ReadoutConfig) -> Readout:
     if most < config.least_move:
         return Readout()
     rounds = config.rounds if most >= config.move_to_track_again else 1
-    pairs = frames.spread(config.pairs)
 
-    def left_of(readout: Readout) -> list[FoundTime | None]:
+    def left_of(readout: Readout, quantile: float) -> list[FoundTime | None]:
+        pairs = frames.spread(config.pairs, quantile)
         with _made_still(log, readout, parts):
             return _estimated(frames, pairs, config, kinds, by_columns=readout.by_columns)
 
     for by_columns in ORIENTATIONS:
-        found = Readout(by_columns=by_columns)
-        left = left_of(found)
+        found, quantile = Readout(by_columns=by_columns), LARGEST
+        left = left_of(found, quantile)
         if left[0] is None:  # halves of images that are sheared too much cannot be registered
-            pairs = frames.spread(config.pairs, TYPICAL)
-            left = left_of(found)
+            quantile = TYPICAL
+            left = left_of(found, quantile)
         certain = _certain(left, config)
         if any(certain):
             first = found = _added(found, left, certain, longest_s)
             for done in range(2, (MOST_ROUNDS if rounds > 1 else 1) + 1):
-                before, found = found, _added(found, left_of(found), certain, longest_s)
+                before, found = found, _added(found, left_of(found, quantile), certain, longest_s)
                 in_first = math.copysign(1.0, first.color_s)  # the direction of the first round
                 grown_s = in_first * (found.color_s - before.color_s)
                 if done >= rounds and grown_s <= SETTLED * in_first * found.color_s:

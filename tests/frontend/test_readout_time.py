@@ -164,6 +164,29 @@ def test_halves_that_move_too_differently_give_way_to_others(
     assert seen[0] != seen[1] == seen[2] == seen[3]
 
 
+def test_columns_are_looked_at_in_the_pairs_that_rows_were(
+    logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where rows of the views of the largest change cannot be registered, columns of them may be."""
+    seen: list[tuple[bool, list[tuple[int, int]]]] = []
+
+    def estimated(
+        _: object,
+        pairs: list[tuple[MovingView, MovingView]],
+        *__: object,
+        by_columns: bool,
+    ) -> object:
+        seen.append((by_columns, [(first.index, second.index) for first, second in pairs]))
+        return [None, None]
+
+    monkeypatch.setattr(readout_time, "_estimated", estimated)
+    assert not found(logs["none"]).rolls
+    (rows, largest), (_, typical), (columns, *first), (_, *second) = seen
+    assert (rows, columns) == (False, True)
+    assert largest != typical
+    assert (first, second) == ([largest], [typical])
+
+
 def parts_of(path: Path, out: Path, config: FrontendConfig) -> set[str]:
     """Run the front end; names of what it did."""
     parts = set[str]()
