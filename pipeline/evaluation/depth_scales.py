@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from duagc.pipeline.base.component_names import robot_of, same_robot
+from duagc.pipeline.base.component_names import same_robot
 from duagc.pipeline.evaluation.feature_agreement import FEATURES, MatchedPair, match_views
 from duagc.pipeline.evaluation.network import is_inlier
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry.statistics import evenly_spaced_to_ends, mad_sigma
-from duagc.pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
 from duagc.pipeline.registration.features import Features, extract
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
 
@@ -67,11 +67,16 @@ def depth_scales(run: RunFolder, source: Recording, decisions: Iterable[Any]) ->
             keyframes[robot].add((theirs, own))
     found = {}
     with ExitStack() as opened:
-        logs = {name: opened.enter_context(open_rgbd(source.log(name))) for name in source.robots}
+
+        @cache
+        def log_of(robot: str) -> RgbdLog:
+            log = opened.enter_context(open_rgbd(source.log(robot)))
+            log.move_depth_by(run.robots[robot].folder / "frontend.mcap")
+            return log
 
         @cache
         def features(robot: str, keyframe: int) -> Features:
-            log = logs[robot_of(robot)]
+            log = log_of(robot)
             frame = log.frame(run.robots[robot].keyframes[keyframe].frame_index)
             return extract(frame.color, frame.usable_depth, log.camera, FEATURES, mask=frame.mask)
 

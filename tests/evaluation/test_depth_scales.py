@@ -28,7 +28,7 @@ def test_depth_that_is_longer_is_found(
                 seen = log.frame(index)
                 return replace(seen, depth=seen.depth * factor)
 
-            yield SimpleNamespace(camera=log.camera, frame=frame)
+            yield SimpleNamespace(camera=log.camera, frame=frame, move_depth_by=log.move_depth_by)
 
     monkeypatch.setattr(depth_scales, "open_rgbd", scaled)
     run = RunFolder(small_run)
@@ -39,6 +39,28 @@ def test_depth_that_is_longer_is_found(
     assert of_bravo["depth_ratio_closures"] >= depth_scales.FEWEST_CLOSURES
     assert isinstance(depth_scales.section(run.robots["alpha"], found)["depth_ratio"], Absent)
     assert isinstance(depth_scales.section(run.robots["bravo"], {})["depth_ratio"], Absent)
+
+
+def test_depth_of_another_time_is_moved_as_the_own_front_end_found(
+    small_run: Path, small_recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it is read by the front end, and by all else that measures a run."""
+
+    @contextmanager
+    def late(path: Path):
+        moved_by: list[Path] = []
+        with open_rgbd(path) as log:
+
+            def frame(index: int):
+                assert moved_by == [small_run / "robots" / log.robot / "frontend.mcap"]
+                return log.frame(index)
+
+            yield SimpleNamespace(camera=log.camera, frame=frame, move_depth_by=moved_by.append)
+
+    monkeypatch.setattr(depth_scales, "open_rgbd", late)
+    run = RunFolder(small_run)
+    found = depth_scales.depth_scales(run, Recording(small_recording), Session(run).loop_closures)
+    assert list(found) == ["bravo"]
 
 
 def test_the_stated_deviation_is_that_of_a_median() -> None:
