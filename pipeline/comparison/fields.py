@@ -113,8 +113,7 @@ def _compare(name: str, first: Any, second: Any) -> Unequal | None:
     place = tuple(int(i) for i in np.argwhere(differ)[0])
     largest, scale, gaps, sizes = None, 0.0, np.zeros(0), np.zeros(0)
     if a.dtype.kind in "fiu" and b.dtype.kind in "fiu":
-        with np.errstate(invalid="ignore", over="ignore"):
-            gap = np.where(differ, np.abs(a.astype(np.float64) - b.astype(np.float64)), 0.0)
+        gap = np.where(differ, _gaps(a, b), 0.0)
         gap = np.where(np.isnan(gap), np.inf, gap)
         largest = float(gap.max())
         size = np.abs(a.astype(np.float64))
@@ -136,6 +135,15 @@ def _compare(name: str, first: Any, second: Any) -> Unequal | None:
     )
 
 
+def _gaps(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
+    """Absolute differences; of whole numbers exact ones, for nanoseconds of a date have more digits than a float."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        if a.dtype.kind == b.dtype.kind != "f":
+            apart = np.asarray(np.maximum(a, b) - np.minimum(a, b))  # may wrap around
+            return apart.view(f"u{apart.itemsize}").astype(np.float64)
+        return np.asarray(np.abs(a.astype(np.float64) - b.astype(np.float64)))
+
+
 def _both_nan(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
     if a.dtype.kind == "f" and b.dtype.kind == "f":
         return np.isnan(a) & np.isnan(b)
@@ -151,14 +159,12 @@ def _array(value: Any) -> NDArray[Any] | None:
     if isinstance(value, bool | int | float | np.number):
         found = np.asarray(value)
         return found if found.dtype.kind in "fiub" else None
-    if (
-        hasattr(value, "__len__")
-        and not isinstance(value, str)
-        and len(value)
-        and isinstance(value[0], int | float)
-    ):
-        return np.asarray(value)
-    return None
+    if isinstance(value, str) or not hasattr(value, "__len__") or not len(value):
+        return None
+    if not all(isinstance(element, int | float) for element in value):
+        return None
+    found = np.asarray(value)
+    return found if found.dtype.kind in "fiub" else None
 
 
 def _plain(value: Any) -> Any:

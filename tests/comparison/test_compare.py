@@ -259,3 +259,26 @@ def test_signs_and_missing_numbers_count_as_values() -> None:
     assert text("a", "b") == ["x: a and b"]
     assert [found.text() for found in unequal({}, {"y": 2})] == ["y: absent and 2"]
     assert not Tolerances().allow("x", unequal({"x": 1.0}, {"x": 2.0})[0])
+
+
+@pytest.mark.parametrize("kind", [int, np.int64, np.uint64])
+def test_times_of_a_date_are_compared_to_the_nanosecond(kind: Any) -> None:
+    """A float has steps of 256 ns there: a tolerance of nothing would allow one."""
+    stamp_ns = 1_305_031_102_175_304_000
+    for apart_ns in (1, -100):
+        (found,) = unequal({"stamp_ns": kind(stamp_ns)}, {"stamp_ns": kind(stamp_ns + apart_ns)})
+        assert found.largest == abs(apart_ns)
+        assert not found.within(0.5, 0.0)
+        assert found.within(100.0, 0.0)
+    (found,) = unequal({"far": np.int64(-(1 << 63))}, {"far": np.int64((1 << 63) - 1)})
+    assert found.largest == pytest.approx(2.0**64)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [([1.0, None], [1.0, 2.0]), ([1, [2]], [1, [3]]), ([1 << 70], [1 << 71])]
+)
+def test_lists_of_more_than_numbers_are_compared_as_they_are(first: list[Any], second: list[Any]) -> None:
+    assert unequal({"of": first}, {"of": first}) == []
+    (found,) = unequal({"of": first}, {"of": second})
+    assert (found.first, found.second) == (str(first), str(second))
+    assert found.largest is None
