@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import check_file, new_file, read_bytes
+from duagc.pipeline.base.files import check_file, new_file
 from duagc.pipeline.splat.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814  # color = 0.5 + SH_DEGREE_0 * coefficient
@@ -23,6 +23,7 @@ PROPERTIES = (
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 _HEADER_LIMIT_BYTES = 1 << 16
+_MOST_DIGITS = 18  # of a number of Gaussians
 
 
 def write_ply(path: str | Path, gaussians: Gaussians) -> None:
@@ -105,19 +106,30 @@ def gaussians_in_ply(path: Path) -> int:
     Raises:
         DuagError: it is not such a file.
     """
-    check_file(path, "a map")
-    with path.open("rb") as file:
-        return _head(file.read(_HEADER_LIMIT_BYTES), path)[0]
+    return _layout(path)[0]
 
 
 def _read_table(path: Path) -> NDArray[np.float32]:
     """The vertices as float32 [n, 17] after a strict check of the header and of the file's length."""
-    data = read_bytes(path, "a map")
-    count, start = _head(data, path)
-    body, row_bytes = data[start:], 4 * len(PROPERTIES)
-    if len(body) != count * row_bytes:
-        raise DuagError(f"{path}: {len(body)} bytes of vertices, expected {count * row_bytes}")
-    return np.frombuffer(body, dtype="<f4").reshape(-1, len(PROPERTIES))
+    count, start, size = _layout(path)
+    expected = count * 4 * len(PROPERTIES)
+    if size - start != expected:
+        raise DuagError(f"{path}: {size - start} bytes of vertices, expected {expected}")
+    try:
+        table = np.fromfile(path, dtype="<f4", offset=start)
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected a map") from error
+    return table.reshape(-1, len(PROPERTIES))
+
+
+def _layout(path: Path) -> tuple[int, int, int]:
+    """How many vertices a file says that it holds, at which byte they begin, and its size in bytes."""
+    size = check_file(path, "a map")
+    try:
+        with path.open("rb") as file:
+            return *_head(file.read(_HEADER_LIMIT_BYTES), path), size
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected a map") from error
 
 
 def _head(data: bytes, path: Path) -> tuple[int, int]:
@@ -130,7 +142,8 @@ def _head(data: bytes, path: Path) -> tuple[int, int]:
     if len(lines) < 2 or lines[0] != "format binary_little_endian 1.0":
         raise DuagError(f"{path}: format is {lines[:1]}, expected binary_little_endian 1.0")
     words = lines[1].split()
-    if len(words) != 3 or words[:2] != ["element", "vertex"] or not words[2].isdigit():
+    counted = len(words) == 3 and words[:2] == ["element", "vertex"] and words[2].isdigit()
+    if not counted or len(words[2]) > _MOST_DIGITS:
         raise DuagError(f"{path}: first element is '{lines[1]}', expected 'element vertex N'")
     if lines[2:] != [f"property float {name}" for name in PROPERTIES]:
         raise DuagError(f"{path}: properties differ from {' '.join(PROPERTIES)}, all float, in this order")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from duagc.pipeline.base import files
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.ply import PROPERTIES, SH_DEGREE_0, gaussians_in_ply, read_ply, write_ply
@@ -61,6 +62,14 @@ def test_round_trip(tmp_path: Path, n: int) -> None:
     np.testing.assert_array_equal(again.means, back.means)
 
 
+def test_a_map_may_be_larger_than_a_whole_file_that_is_read_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "LARGEST_BYTES", 10_000)
+    write_ply(tmp_path / "map.ply", some(1000))
+    assert len(read_ply(tmp_path / "map.ply")) == 1000
+
+
 def test_a_refused_map_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     write_ply(path, some(3))
@@ -78,6 +87,7 @@ def test_a_refused_map_leaves_the_old_file(tmp_path: Path) -> None:
     [
         (b"binary_little_endian", b"ascii", "expected binary_little_endian"),
         (b"element vertex 3", b"element vertex 4", "bytes of vertices, expected 272"),
+        (b"element vertex 3", b"element vertex " + b"3" * 5000, "expected 'element vertex N'"),
         (b"property float opacity", b"property float alpha", "properties differ"),
         (b"ply\n", b"PLY\n", "not a .ply file"),
         (b"end_header\n", b"end_header\nx", "bytes of vertices"),
