@@ -111,14 +111,17 @@ class Store:
 
         Args:
             key: of the computation.
-            say: gets a line if an entry is damaged, which is then removed.
+            say: gets a line if an entry is damaged, which is then removed, or cannot be read.
         """
         path = self._entry(key)
         try:
             entry = _read(path)
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except OSError as error:  # of this process: others may still read it
+            say(f"{path}: {error.strerror or error}, expected a stored result; computed again")
+            return None
+        except (ValueError, KeyError, TypeError) as error:
             say(f"{path}: is damaged ({error}); computed again")
             with suppress(OSError):
                 path.unlink()

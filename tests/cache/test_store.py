@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -134,6 +135,16 @@ def test_a_damaged_entry_is_named_and_computed_again(bench: Bench, damage: Calla
     damage(path)
     assert bench.carry().executed
     assert [line for line in bench.said if f"{path.name}: is damaged" in line] == bench.said != []
+    assert not bench.carry().executed
+
+
+def test_an_entry_that_this_process_cannot_read_stays(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    carried = bench.carry()
+    (path,) = (bench.folder / "store" / "entries").rglob("*.json")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_text", Mock(side_effect=PermissionError(13, "Permission denied")))
+        assert bench.store.find(carried.entry.key, bench.said.append) is None
+    assert bench.said == [f"{path}: Permission denied, expected a stored result; computed again"]
     assert not bench.carry().executed
 
 
@@ -265,6 +276,7 @@ def test_a_changed_file_has_another_digest_and_an_unchanged_one_is_not_read(tmp_
 CLAIMANT = """
 import sys, time
 from pathlib import Path
+from unittest.mock import Mock
 from duagc.pipeline.cache.claims import claim
 folder = Path(sys.argv[1])
 with claim(folder, lambda: False, lambda: None):
