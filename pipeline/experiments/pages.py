@@ -179,7 +179,7 @@ def _section(one: JudgedExperiment) -> dict[str, Any]:
         "limits": file.limits,
         "sha256": one.experiment.sha256,
         "code": f"code `{one.result['code_sha256'][:12]}`"
-        if "code_sha256" in one.result
+        if one.result.get("code_sha256")
         else "code not recorded",
         "profile": profile,
         "level": f"{file.level:g}",

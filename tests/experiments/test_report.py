@@ -205,7 +205,8 @@ def test_the_page_says_where_sections_are_of_different_code(
     assert result["code_sha256"] != _code(place)
     _only_stage(monkeypatch, "closest", simulator="closest")
     assert result["code_sha256"] != _code(place)
-    other = {"same": result, "older": {k: v for k, v in result.items() if k != "code_sha256"}}
+    older = {k: v for k, v in result.items() if k != "code_sha256"}
+    other = {"same": result, "older": older, "null": {**older, "code_sha256": None}}
     pages = {}
     for name, twin in other.items():
         for file, document in (("mine", result), ("twin", twin)):
@@ -218,6 +219,7 @@ def test_the_page_says_where_sections_are_of_different_code(
     assert "Not all sections" not in pages["same"]
     assert "**Not all sections are known to be of the same code**" in pages["older"]
     assert "; code not recorded." in pages["older"]
+    assert pages["null"] == pages["older"]
 
 
 def test_a_result_under_another_rule_is_refused(place: Path, tmp_path: Path) -> None:
