@@ -287,7 +287,8 @@ class MapBuilder:
                 self._with_images(mapper.put_back, k, seeds=True)
         for frame in supporting:
             self._support(mapper, frame)
-        views = [self._keyframes[k].frame_index for k in tile] + [f.frame_index for f in supporting]
+        own, border = ([self._keyframes[k].frame_index for k in ks] for ks in (tile, mapper.border_keyframes))
+        views = [*own, *(frame.frame_index for frame in supporting), *border]
         mapper.open_shutter([self.log.moments(index) for index in views])
         return mapper
 

@@ -71,13 +71,20 @@ class MapContent:
         """Poses [m, 4, 4] of the supporting frames, in the order in which they were added; `finalize` refines them."""
         return np.array([view.T_map_camera for view in self._support]).reshape(-1, 4, 4)
 
+    @property
+    def border_keyframes(self) -> list[int]:
+        """Indices of the keyframes of other tiles that take part, in the order in which they were added."""
+        return [view.index for view in self._borders]
+
     def open_shutter(self, moments: Sequence[NDArray[np.float64] | None]) -> None:
         """Say where the camera is while its shutter is open.
 
         Args:
-            moments: T_camera_moment [k, 4, 4] of keyframes and supporting frames, as of `TrainingView`.
+            moments: T_camera_moment [k, 4, 4] of keyframes, of supporting frames, and of keyframes of other tiles,
+                as of `TrainingView`.
         """
-        for view, T_camera_moment in zip((*self._views, *self._support), moments, strict=True):
+        views = (*self._views, *self._support, *self._borders)
+        for view, T_camera_moment in zip(views, moments, strict=True):
             view.T_camera_moment = T_camera_moment
 
     def state(self) -> tuple[Any, ...]:

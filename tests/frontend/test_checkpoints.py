@@ -15,7 +15,8 @@ from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.frontend.stage import run_frontend
-from duagc.pipeline.recording import content_digest
+from duagc.pipeline.recording import RgbdLog, content_digest, read_log
+from duagc.schemas import topics
 from tests.fixtures.films import walk_around
 from tests.frontend import test_depth_times, test_submaps
 
@@ -28,7 +29,13 @@ SMALL = (
 )
 CONFIG = load_config(RunConfig, overrides=[*SMALL, "frontend.tracking.strides=[2, 1, 1, 1]"]).frontend
 
-
+_TILES = {"whole_keyframes": 2, "tile_keyframes": 2, "border_keyframes": 1}
+TILED = CONFIG.model_copy(
+    update={
+        "mapping": CONFIG.mapping.model_copy(update=_TILES),
+        "keyframes": CONFIG.keyframes.model_copy(update={"min_overlap": 0.98}),  # many of them
+    }
+)
 MOST_KILLS = 100
 
 
@@ -109,16 +116,23 @@ def test_killed_again_and_again_it_ends_with_the_same_bits(
 
 
 def test_killed_in_any_tile_of_the_map_it_ends_with_the_same_bits(log: Path, tmp_path: Path) -> None:
-    mapping = CONFIG.mapping.model_copy(
-        update={"whole_keyframes": 2, "tile_keyframes": 2, "border_keyframes": 1}
-    )
-    keyframes = CONFIG.keyframes.model_copy(update={"min_overlap": 0.98})  # many of them
-    config = CONFIG.model_copy(update={"mapping": mapping, "keyframes": keyframes})
-    digest, _ = undisturbed(log, config, tmp_path)
-    runs = Runs(log, tmp_path, config)
+    digest, _ = undisturbed(log, TILED, tmp_path)
+    runs = Runs(log, tmp_path, TILED)
     assert runs.until_done(3) == digest
     for part, least in (("alpha.mapping", 1), ("alpha.final", 10)):
         assert len({line for line in runs.said if line.startswith(f"{part}: goes on")}) >= least, runs.said
+
+
+def test_every_view_of_a_tile_is_where_its_camera_was(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While its shutter was open; those of other tiles at its border as well as its own."""
+    asked: list[int] = []
+    monkeypatch.setattr(RgbdLog, "moments", lambda _, index: asked.append(index))
+    run_frontend(log, tmp_path / "frontend.mcap", TILED)
+    topic = topics.KEYFRAME.of("alpha")
+    frames = {record.message().frame_index for record in read_log(tmp_path / "frontend.mcap", (topic,))}
+    assert {asked.count(frame) for frame in frames} >= {1, 2}
 
 
 def test_killed_while_tracking_by_rendering_it_ends_with_the_same_bits(log: Path, tmp_path: Path) -> None:

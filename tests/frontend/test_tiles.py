@@ -7,6 +7,7 @@ import pytest
 
 from duagc.pipeline.base import shelf
 from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import SparseStepsConfig
 from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping import Mapper
 from duagc.pipeline.frontend.tiles import border_keyframes, make_tiles, take_tile
@@ -126,6 +127,23 @@ def test_only_the_images_of_its_tile_change_a_gaussian_in_the_end() -> None:
     old = np.isin(whole.gaussians.ids, ids)
     assert same(_by_id(whole.gaussians.select(np.isin(whole.gaussians.ids, guests.ids))), guests)
     assert set(whole.gaussians.anchors[~old].tolist()) == {2, 3}
+
+
+def test_views_at_the_border_are_drawn_as_their_camera_moved() -> None:
+    config = QUICK.model_copy(update={"sparse": SparseStepsConfig(moving_from=0.7)})
+    moments = se3.exp(np.linspace(-0.02, 0.02, 3)[:, None] * np.array([1.0, 0, 0, 0, 1, 0]))
+    maps = []
+    for given in (None, moments):
+        part = take_tile(_grown(2), [2, 3], _sights([2, 3]), _sights([0, 1]))
+        mapper = Mapper(CAMERA, config, seed=5, begun=part, tile=1)
+        _border(mapper, [0, 1])
+        for k in (2, 3):
+            mapper.add_keyframe(k, posed(POSES[k]))
+        assert mapper.border_keyframes == [0, 1]
+        mapper.open_shutter([None, None, given, given])
+        mapper.finalize()
+        maps.append(mapper.gaussians)
+    assert not same(*maps)
 
 
 def _tiled(config: MappingConfig, tiles: Sequence[Sequence[int]], threads: int = 1) -> Mapper:
