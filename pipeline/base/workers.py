@@ -150,7 +150,7 @@ def peak_memory_bytes() -> int:
     """Most memory that this process has held. `getrusage` would count the parent that it was started from."""
     status = Path("/proc/self/status")
     if status.exists():
-        for line in status.read_text().splitlines():
+        for line in status.read_text(errors="replace").splitlines():  # the name may be cut in a letter
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -159,7 +159,9 @@ def _host() -> str:
 def _started(pid: int) -> str:
     """When a process began, by the kernel's own count; "" if there is none or the kernel does not say."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_text()
+        text = Path(f"/proc/{pid}/stat").read_text(
+            errors="replace"
+        )  # the name of a program may be cut in a letter
     except OSError:
         return ""
     fields = text[text.rfind(")") + 2 :].split()

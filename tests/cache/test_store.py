@@ -315,6 +315,18 @@ def test_a_claim_is_waited_for_and_that_of_a_killed_process_is_taken(tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
+def test_a_process_may_have_a_name_that_is_cut_in_a_letter() -> None:
+    code = (
+        "import ctypes; ctypes.CDLL(None).prctl(15, 'größe'.encode()[:3])\n"
+        "from duagc.pipeline.base.workers import peak_memory_bytes\n"
+        "from duagc.pipeline.cache.claims import has_ended, this_process\n"
+        "print(peak_memory_bytes() > 0, has_ended(this_process()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("True False\n", "")
+
+
 def test_gc_removes_what_was_not_used_for_longest(bench: Bench) -> None:
     store = bench.folder / "store"
     for k, letter in enumerate("abc"):
