@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import check_file, new_file
+from duagc.pipeline.base.files import MOST_OF_LINE, check_file, new_file
 from duagc.pipeline.splat.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814  # color = 0.5 + SH_DEGREE_0 * coefficient
@@ -144,7 +144,7 @@ def _head(data: bytes, path: Path) -> tuple[int, int]:
     words = lines[1].split()
     counted = len(words) == 3 and words[:2] == ["element", "vertex"] and words[2].isdigit()
     if not counted or len(words[2]) > _MOST_DIGITS:
-        raise DuagError(f"{path}: first element is '{lines[1]}', expected 'element vertex N'")
+        raise DuagError(f"{path}: first element is '{lines[1][:MOST_OF_LINE]}', expected 'element vertex N'")
     if lines[2:] != [f"property float {name}" for name in PROPERTIES]:
         raise DuagError(f"{path}: properties differ from {' '.join(PROPERTIES)}, all float, in this order")
     return int(words[2]), end + len(b"end_header\n")

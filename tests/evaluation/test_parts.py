@@ -145,7 +145,7 @@ def test_distance_from_a_sampled_corner_does_not_feel_the_sampling():
     assert (distance.shape, direction.shape) == ((0,), (0, 3))
 
 
-@pytest.mark.parametrize("damage", ["cut", "ascii", "not finite", "no normals", "empty"])
+@pytest.mark.parametrize("damage", ["cut", "ascii", "not finite", "no normals", "empty", "digits"])
 def test_damaged_geometry_is_one_line(tmp_path, damage):
     path = tmp_path / "groundtruth.ply"
     points = np.random.default_rng(0).normal(size=(50, 3))
@@ -157,6 +157,7 @@ def test_damaged_geometry_is_one_line(tmp_path, damage):
         "not finite": whole[:-27] + np.full(6, np.nan, "<f4").tobytes() + whole[-3:],
         "no normals": whole.replace(b" nx", b" ax"),
         "empty": b"",
+        "digits": whole.replace(b"vertex 50", b"vertex " + b"5" * 5000),
     }
     recording = SimpleNamespace(geometry=lambda: path)
     assert len(surface(recording).points) == 50
