@@ -171,6 +171,7 @@ def _log(log: Log) -> dict[str, Any]:
                 "schema": topic.schema,
                 "encoding": topic.encoding,
                 "messages": topic.count,
+                "other_types": dict(topic.others),
                 "rate_hz": _rate(times[name]),
                 "recorded_after_header_s": _median_s(delays.get(name, [])),
             }
@@ -269,7 +270,8 @@ def _log_lines(name: str, log: Mapping[str, Any]) -> list[str]:
         rate = f"{t['rate_hz']:8.2f} Hz" if t["rate_hz"] else " " * 11
         delay = t["recorded_after_header_s"]
         text = "" if delay is None else f"  recorded {delay:.3f} s after its header"
-        lines.append(f"  {topic:<{width}}  {t['messages']:>7}  {rate}  {t['type']}{text}")
+        others = "".join(f", and {count} of {kind}" for kind, count in t["other_types"].items())
+        lines.append(f"  {topic:<{width}}  {t['messages']:>7}  {rate}  {t['type']}{others}{text}")
     return lines
 
 

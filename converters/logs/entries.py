@@ -19,7 +19,7 @@ SOUND_TIMES = "one between the years 1970 and 2116"
 
 
 class InvalidMessage(DuagError):  # noqa: N818 (the name says it)
-    """The bytes of a message are none of its type; others of its topic may be sound.
+    """The bytes of a message are none of the type of its topic; others of the topic may be sound.
 
     Attributes:
         why: what they are, without the place.
@@ -42,10 +42,13 @@ class LogTopic:
 
     Attributes:
         type: ROS's name of it ("sensor_msgs/msg/Image"), or the schema's own if it has none.
+            If the topic holds several: the one that most messages have.
         schema: as the file names them.
         encoding: as the file names them.
-        count: messages.
+        count: messages, of all types.
         metadata: that the channel states, where the container holds any.
+        others: messages of other types than `type`, by type.
+        remark: what users should know who read it; empty: nothing.
     """
 
     name: str
@@ -54,6 +57,8 @@ class LogTopic:
     encoding: str
     count: int
     metadata: Mapping[str, str] = field(default_factory=dict)
+    others: Mapping[str, int] = field(default_factory=dict)
+    remark: str = ""
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,7 @@ class Entry:
         data: as it stands in the container.
         read: the message, with ROS's fields.
         header_ns: the time in its header, 0 where it has none.
+        type: as `LogTopic` has it; empty: that of its topic.
     """
 
     topic: str
@@ -74,6 +80,7 @@ class Entry:
     data: bytes
     read: Callable[[], Any]
     header_ns: Callable[[], int]
+    type: str = ""
 
 
 class LogPart(Protocol):
@@ -163,6 +170,18 @@ def ros_type(schema: str) -> str:
     """
     parts = schema.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else schema
+
+
+def reason(error: Exception) -> str:
+    """What an error says, on one line; its kind if it says nothing.
+
+    Args:
+        error: any exception.
+
+    Returns:
+        At most 200 characters.
+    """
+    return " ".join(str(error).rstrip(".").split())[:200] or type(error).__name__
 
 
 def stamp_ns(message: Any) -> int:

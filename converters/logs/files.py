@@ -14,13 +14,13 @@ from __future__ import annotations
 import heapq
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from duagc.converters.logs.entries import Entry, LogPart, LogTopic
 from duagc.converters.logs.invalid import InvalidMessages
 from duagc.converters.logs.rgbd_messages import with_members
+from duagc.converters.logs.topic_types import as_one, of_their_types
 from duagc.converters.logs.video import images, is_video
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording.names import LOG_RECORD, MAGIC
@@ -38,21 +38,13 @@ class Log:
         Args:
             parts: the containers; a topic may be in several.
             name: how messages for people call it.
-
-        Raises:
-            DuagError: two parts have a topic of one name and different types.
         """
         self.parts, self.name = list(parts), name
-        self.topics: dict[str, LogTopic] = {}
+        stated: dict[str, list[LogTopic]] = {}
+        for topic in (topic for part in self.parts for topic in part.topics.values()):
+            stated.setdefault(topic.name, []).append(topic)
+        self.topics = {topic: as_one(found) for topic, found in stated.items()}
         self.invalid = InvalidMessages(self.topics)
-        for part in self.parts:
-            for topic in part.topics.values():
-                known = self.topics.get(topic.name)
-                if known and known.type != topic.type:
-                    raise DuagError(
-                        f"{part.path}: {topic.name} holds {topic.type}, expected {known.type} as in {parts[0].path}"
-                    )
-                self.topics[topic.name] = replace(topic, count=topic.count + (known.count if known else 0))
 
     def __enter__(self) -> Log:
         return self
@@ -81,15 +73,24 @@ class Log:
         """
         films = {t for t in topics if t in self.topics and is_video(self.topics[t].type)} - set(heads)
         streams = [
-            part.entries(wanted, [t for t in wanted if t in heads])
+            self._entries_of(part, wanted, [t for t in wanted if t in heads])
             for part in self.parts
             if (wanted := [t for t in topics if t in part.topics and t not in films])
         ]
         for topic in sorted(films):
             streams.append(
-                images(_merged([part.entries([topic]) for part in self.parts if topic in part.topics]))
+                images(
+                    _merged([self._entries_of(part, [topic]) for part in self.parts if topic in part.topics])
+                )
             )
         return _merged(streams)
+
+    def _entries_of(self, part: LogPart, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
+        """Messages of a part; those of another type than their topic are none."""
+        entries = part.entries(topics, heads)
+        if not any(self.topics[topic].others for topic in topics):
+            return entries
+        return of_their_types(entries, self.topics, str(part.path))
 
     def messages(self, topic: str) -> Iterator[Any]:
         """The messages of a topic in order of recording, without those that are none.

@@ -1,4 +1,4 @@
-"""Messages of a log that are none: their bytes are cut, or of another type than their topic says.
+"""Messages of a log that are none: their bytes are cut, or of another type than most of their topic.
 
 One of them costs itself: it is left out, and said with its topic, its time and how many there are. Where most messages
 of a topic are such, the log is not what it says, and that is an error.
@@ -60,12 +60,13 @@ class InvalidMessages:
         return None if found is None else found[min(found)]
 
     def words(self, topics: Collection[str]) -> list[str]:
-        """What to warn of: one line for every topic.
+        """What to warn of: for every topic what its log remarks on it, and the messages that were left out.
 
         Args:
             topics: those that are converted.
         """
-        lines = []
+        known = [self._topics[topic] for topic in sorted(set(topics) & self._topics.keys())]
+        lines = [f"{topic.name}: {topic.remark}" for topic in known if topic.remark]
         for topic in sorted(self._found.keys() & set(topics)):
             found = self._found[topic]
             first_ns = min(found)

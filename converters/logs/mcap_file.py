@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -15,17 +14,19 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from duagc import schemas
 from duagc.converters.logs import foxglove, ros_json
-from duagc.converters.logs.definitions import of_ros2
-from duagc.converters.logs.entries import Entry, InvalidMessage, LogTopic, ros_type, sound_time, stamp_ns
-from duagc.converters.logs.mcap_chunks import Chunks
-from duagc.converters.logs.rosbag_file import (
-    LARGEST_CHUNK,
-    check_definitions,
-    deserialized,
-    reading,
+from duagc.converters.logs.entries import (
+    Entry,
+    InvalidMessage,
+    LogTopic,
     reason,
-    ros_header_ns,
+    ros_type,
+    sound_time,
+    stamp_ns,
 )
+from duagc.converters.logs.mcap_chunks import Chunks
+from duagc.converters.logs.ros_messages import RosMessages
+from duagc.converters.logs.rosbag_file import LARGEST_CHUNK, reading
+from duagc.converters.logs.topic_types import as_one
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
 from duagc.pipeline.recording.names import MAGIC, is_mcap
@@ -48,6 +49,7 @@ class McapFile:
         self.path = path
         self.topics: dict[str, LogTopic] = {}
         self._decoders: dict[int, _Decoder] = {}
+        self._kinds: dict[int, str] = {}  # of their messages, as `LogTopic` has it
         check_file(path, WANTED)
         with reading(path, WANTED):
             self._stream = path.open("rb")
@@ -100,7 +102,8 @@ class McapFile:
         kind = foxglove.ROS_TYPES.get(plain)
         if schema and encoding in ("cdr", "ros1"):
             kind = kind or ros_type(name)
-            self._decoders[channel.id] = _Ros(schema, encoding)
+            text, is_idl = schema.data.decode(errors="replace"), schema.encoding == "ros2idl"
+            self._decoders[channel.id] = RosMessages(name, encoding, text, is_idl=is_idl)
         elif schema and kind and encoding in ("protobuf", "json"):
             self._decoders[channel.id] = _Foxglove(schema, encoding)
         elif schema and encoding == "json" and ros_json.is_read(ros_type(name)):
@@ -109,15 +112,11 @@ class McapFile:
         else:  # nothing that is read here; still shown to people
             kind = f"{name or 'no schema'} as {encoding or 'nothing known'}"
             self._decoders[channel.id] = _Unknown(kind)
+        stated = dict(channel.metadata)
+        topic = LogTopic(channel.topic, kind, name, encoding, count, stated)
         known = self.topics.get(channel.topic)
-        if known and known.count and count and known.type != kind:
-            raise DuagError(
-                f"{self.path}: {channel.topic} holds {known.type} and {kind}, expected one of them"
-            )
-        if count or not known:
-            total = count + (known.count if known else 0)
-            stated = dict(channel.metadata)
-            self.topics[channel.topic] = LogTopic(channel.topic, kind, name, encoding, total, stated)
+        self.topics[channel.topic] = as_one([known, topic]) if known else topic
+        self._kinds[channel.id] = kind
 
     def _records(self) -> Iterator[Any]:
         """Schemas, channels and messages in the order of the file; several may be on their way."""
@@ -196,6 +195,7 @@ class McapFile:
                     data,
                     partial(decoder.read, data, where),
                     partial(decoder.header_ns, data, where),
+                    type=self._kinds[number],
                 )
 
     def close(self) -> None:
@@ -225,60 +225,6 @@ class _Decoder(Protocol):
     def tells_time(self, head: bytes) -> bool:
         """Whether `header_ns` needs no more than these first bytes of a message."""
         ...
-
-
-class _Ros:
-    """Messages of ROS by the definitions that the file carries."""
-
-    def __init__(self, schema: Schema, encoding: str) -> None:
-        self.schema, self.encoding, self.type = schema, encoding, ros_type(schema.name)
-        self._of_ros = foxglove.plain_name(schema.name) not in foxglove.ROS_TYPES
-        self._deserialize: Any = None
-
-    def _store(self) -> Any:
-        """Understood when the first message is read: definitions that are not needed may be beyond the parser."""
-        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-
-        text = self.schema.data.decode()
-        if not text.strip():  # a recorder that had no definitions at hand
-            return of_ros2() if self.encoding == "cdr" else get_typestore(Stores.ROS1_NOETIC)
-        store = get_typestore(Stores.EMPTY)
-        if self.schema.encoding != "ros2idl":
-            store.register(get_types_from_msg(text, self.type))
-            check_definitions(store.fielddefs)
-            return store
-        line = "=" * 80 + "\n"
-        parts = (
-            [part.split("\n", 1)[1] for part in text.split(line)[1:]]
-            if text.startswith(f"{line}IDL: ")
-            else [text]
-        )
-        types: dict[str, Any] = {}
-        for part in parts:
-            types.update(
-                get_types_from_idl(re.sub(r"(?m)^\s*#.*$", "", part))
-            )  # its parser knows no #include
-        store.register(types)
-        check_definitions(store.fielddefs)
-        return store
-
-    def read(self, data: bytes, where: str) -> Any:
-        if self._deserialize is None:
-            try:
-                store = self._store()
-            except Exception as error:  # whatever a broken definition provokes in the parser
-                raise DuagError(
-                    f"{where}: the definition of {self.type} cannot be read ({reason(error)})"
-                ) from error
-            self._deserialize = store.deserialize_cdr if self.encoding == "cdr" else store.deserialize_ros1
-        message = deserialized(self._deserialize, data, self.type, where)
-        return foxglove.as_ros(foxglove.plain_name(self.schema.name), message, where)
-
-    def header_ns(self, data: bytes, where: str) -> int:
-        return ros_header_ns(data, self.encoding, where) if self._of_ros else stamp_ns(self.read(data, where))
-
-    def tells_time(self, head: bytes) -> bool:
-        return self._of_ros
 
 
 class _RosJson:

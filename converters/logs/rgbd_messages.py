@@ -69,13 +69,14 @@ class _WithMembers:
             added = f"{topic.name}/{name.format(image=image)}"
             if value is not None and len(getattr(value, "data", "1")) and added not in self.topics:
                 self._source[added] = topic.name, member
-                self.topics[added] = replace(topic, name=added, type=value.__msgtype__)
+                self.topics[added] = replace(topic, name=added, type=value.__msgtype__, others={})
 
     def _first_sound(self, topic: str) -> Any:
         """The first message of a topic that is one; an error if there is none."""
         for entry in self._part.entries([topic]):
             with suppress(InvalidMessage):
-                return entry.read()
+                if entry.type == self._part.topics[topic].type:
+                    return entry.read()
         raise DuagError(f"{self.path}: {topic} has no sound message, expected one")
 
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
@@ -87,9 +88,15 @@ class _WithMembers:
                 yield entry
             read = cache(entry.read)  # once for all members
             for name, (topic, member) in wanted.items():
-                if topic == entry.topic:
+                if topic == entry.topic and entry.type == self._part.topics[topic].type:
                     stamp = partial(_stamp_ns, read, member)
-                    yield replace(entry, topic=name, read=partial(_member, read, member), header_ns=stamp)
+                    yield replace(
+                        entry,
+                        topic=name,
+                        read=partial(_member, read, member),
+                        header_ns=stamp,
+                        type=self.topics[name].type,
+                    )
 
     def close(self) -> None:
         self._part.close()

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from duagc.converters.logs.entries import InvalidMessage, stamp_ns
+from duagc.converters.logs.entries import InvalidMessage, reason, stamp_ns
 from duagc.converters.logs.foxglove import Base64, json_members
-from duagc.converters.logs.rosbag_file import READ_TYPES, reason
+from duagc.converters.logs.topic_types import READ_TYPES
 
 _ALIASES = {
     "sec": ("secs",),

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path, PosixPath
@@ -12,28 +11,17 @@ from urllib.parse import quote
 
 from duagc.converters.logs import foxglove
 from duagc.converters.logs.bag_messages import messages
-from duagc.converters.logs.definitions import of_ros2
-from duagc.converters.logs.entries import Entry, InvalidMessage, LogTopic, sound_time, stamp_ns
+from duagc.converters.logs.entries import Entry, LogTopic, reason, sound_time
+from duagc.converters.logs.ros_messages import RosMessages
+from duagc.converters.logs.topic_types import as_one
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file, read_text
-from duagc.pipeline.messages.parts import NANOSECONDS
 
-_READ = {
-    "builtin_interfaces": "Time",
-    "std_msgs": "Header",
-    "geometry_msgs": "Point Pose PoseStamped PoseWithCovariance PoseWithCovarianceStamped Quaternion Transform "
-    "TransformStamped Vector3",
-    "nav_msgs": "Odometry",
-    "sensor_msgs": "CameraInfo CompressedImage Image Imu PointCloud2 PointField RegionOfInterest",
-    "tf2_msgs": "TFMessage",
-}
-READ_TYPES = {f"{package}/msg/{name}" for package, names in _READ.items() for name in names.split()}
-LONGEST_FRAME = 4096  # letters; of bytes that are no header the number is most often larger
 LARGEST_CHUNK = 256 << 20  # bytes, unpacked; recorders write some megabytes
 
 
 class RosBag:
-    """A bag, read by rosbags. Bags of ROS 2 without types are read with those of `definitions`."""
+    """A bag, read by rosbags. Types that a bag does not define are those of ROS, and of `definitions`."""
 
     def __init__(self, path: Path) -> None:
         """Open a bag and read what topics it has.
@@ -42,7 +30,7 @@ class RosBag:
             path: a file, or a folder of `ros2 bag`.
 
         Raises:
-            DuagError: it is missing or broken, or defines types otherwise than ROS does.
+            DuagError: it is missing or broken.
         """
         from rosbags.rosbag1 import Reader as Reader1
 
@@ -53,11 +41,11 @@ class RosBag:
             check_file(file, wanted)
         with reading(path, wanted):
             self._reader = _opened(path)
-            check_definitions(self._reader.typestore.fielddefs)
             for reader in self._reader.readers:
                 if isinstance(reader, Reader1):
                     _bound_chunks(reader)
         self._encoding = "cdr" if self._reader.is2 else "ros1"
+        self._decoders: dict[tuple[str, str, str], RosMessages] = {}
         try:
             self.topics = self._topics()
         except BaseException:
@@ -65,22 +53,34 @@ class RosBag:
             raise
 
     def _topics(self) -> dict[str, LogTopic]:
-        topics: dict[str, LogTopic] = {}
+        found: dict[str, list[LogTopic]] = {}
         for c in self._reader.connections:
             connection = c.topic, c.msgtype, c.msgcount  # of a bag of ROS 2 they stand in its metadata
             if not all(map(isinstance, connection, (str, str, int))):
                 raise DuagError(
                     f"{self.path}: found {connection}, expected a topic, its type and number of messages"
                 )
-            before = topics.get(c.topic)
-            if before is not None and before.schema != c.msgtype:
-                raise DuagError(
-                    f"{self.path}: {c.topic} holds {before.schema} and {c.msgtype}, expected one type"
+            found.setdefault(c.topic, []).append(
+                LogTopic(
+                    c.topic,
+                    _kind(c),
+                    c.msgtype,
+                    self._encoding,
+                    c.msgcount,
+                    remark=self._decoder(c).remark(c.digest or ""),
                 )
-            count = c.msgcount + (before.count if before is not None else 0)
-            kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
-            topics[c.topic] = LogTopic(c.topic, kind, c.msgtype, self._encoding, count)
-        return topics
+            )
+        return {topic: as_one(stated) for topic, stated in found.items()}
+
+    def _decoder(self, connection: Any) -> RosMessages:
+        """Of connections that define a type alike the same."""
+        form, text = connection.msgdef
+        key = connection.msgtype, form.name, text
+        if key not in self._decoders:
+            self._decoders[key] = RosMessages(
+                connection.msgtype, self._encoding, text, is_idl=form.name == "IDL"
+            )
+        return self._decoders[key]
 
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
         """Messages of these topics in order of recording.
@@ -92,20 +92,18 @@ class RosBag:
         Raises:
             DuagError: the bag is broken, or a message has no sound time.
         """
-        heads = [t for t in heads if foxglove.plain_name(self.topics[t].schema) not in foxglove.ROS_TYPES]
+        read_whole = {
+            c.topic
+            for c in self._reader.connections
+            if foxglove.plain_name(c.msgtype) in foxglove.ROS_TYPES  # their times may stand anywhere
+        }
+        heads = [topic for topic in heads if topic not in read_whole]
         with reading(self.path, "a sound bag of ROS 1 or ROS 2"):
             for connection, log_ns, raw in messages(self._reader, topics, heads):
-                read = partial(self._read, connection, raw)
-                header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
-                if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
-                    header = partial(_stamp_of, read)
-                time_ns = sound_time(log_ns, f"{self.path}: {connection.topic}")
-                yield Entry(connection.topic, time_ns, None, raw, read, header)
-
-    def _read(self, connection: Any, raw: bytes) -> Any:
-        where = f"{self.path}: {connection.topic}"
-        message = deserialized(self._reader.deserialize, raw, connection.msgtype, where)
-        return foxglove.as_ros(foxglove.plain_name(connection.msgtype), message, where)
+                where, decoder = f"{self.path}: {connection.topic}", self._decoder(connection)
+                read, header = (partial(f, raw, where) for f in (decoder.read, decoder.header_ns))
+                time_ns = sound_time(log_ns, where)
+                yield Entry(connection.topic, time_ns, None, raw, read, header, type=_kind(connection))
 
     def close(self) -> None:
         with reading(self.path, "a sound bag of ROS 1 or ROS 2"):  # a database may notice its damage only now
@@ -130,42 +128,24 @@ class _UriPath(PosixPath):
 
 
 def _opened(path: Path) -> Any:
-    """`AnyReader` of a bag; definitions of types that are not read here may be broken."""
+    """`AnyReader` of a bag; it takes no definitions: those that are broken, or not used, cost no other topic."""
     from rosbags.highlevel import AnyReader
 
-    path = _UriPath(path) if set("#%?") & set(str(path)) else path
-    reader: Any = AnyReader([path], default_typestore=of_ros2())
-    try:
-        reader.open()
-    except Exception:  # of a bag that is broken itself it comes again
-        reader = AnyReader([path], default_typestore=of_ros2())
-        reader._open = partial(_open_sound_types, reader)
-        reader.open()
+    reader: Any = AnyReader([_UriPath(path) if set("#%?") & set(str(path)) else path])
+    reader._open = partial(_open_without_types, reader)
+    reader.open()
     return reader
 
 
-def _open_sound_types(reader: Any) -> None:
-    """What `AnyReader` does to open a bag, without the types that cannot be understood and are not read."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
+def _open_without_types(reader: Any) -> None:
     for inner in reader.readers:
         reader.stack.enter_context(inner)
-    connections = [c for inner in reader.readers for c in inner.connections]
-    store = get_typestore(Stores.EMPTY)
-    for c in sorted(connections, key=lambda c: c.msgtype not in READ_TYPES):
-        try:
-            if c.msgdef.format.name != "MSG":
-                raise ValueError(f"{c.msgtype} is defined in {c.msgdef.format.name}")
-            found, alone = get_types_from_msg(c.msgdef.data, c.msgtype), get_typestore(Stores.EMPTY)
-            alone.register(found)
-            own = alone.hash_rihs01(c.msgtype) if reader.is2 else alone.generate_msgdef(c.msgtype)[1]
-            if c.digest and c.digest != own:
-                raise ValueError(f"{c.msgtype} has digest {c.digest}, expected {own}")
-            store.register(found)
-        except Exception:
-            if c.msgtype in READ_TYPES:
-                raise
-    reader.connections, reader.typestore = connections, store
+    reader.connections = [c for inner in reader.readers for c in inner.connections]
+
+
+def _kind(connection: Any) -> str:
+    """The type of the messages of a connection as `LogTopic` has it."""
+    return foxglove.ROS_TYPES.get(foxglove.plain_name(connection.msgtype), connection.msgtype)
 
 
 def _bound_chunks(reader: Any) -> None:
@@ -213,84 +193,3 @@ def reading(path: Path, expected: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise DuagError(f"{path}: {reason(error)}, expected {expected}") from error
-
-
-def reason(error: Exception) -> str:
-    """What an error says, on one line; its kind if it says nothing.
-
-    Args:
-        error: any exception.
-
-    Returns:
-        At most 200 characters.
-    """
-    return " ".join(str(error).rstrip(".").split())[:200] or type(error).__name__
-
-
-def check_definitions(found: Mapping[str, Any]) -> None:
-    """Refuse a log that defines types that are read here otherwise than ROS does.
-
-    Args:
-        found: fields by type, as rosbags has them.
-
-    Raises:
-        ValueError: a type has other fields.
-    """
-    from rosbags.typesys import Stores, get_typestore
-
-    standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
-    for name in sorted(set(found) & READ_TYPES):
-        # the matrices D, K, R, P of ROS 1 have small letters in ROS 2
-        has, wanted = (
-            {(field if len(field) > 1 else field.lower()): kind for field, kind in types[name][1]}
-            for types in (found, standard)
-        )
-        for field in wanted:
-            if has.get(field) != wanted[field]:
-                raise ValueError(f"its {name} has no field {field} as ROS has it")
-
-
-def deserialized(read: Any, raw: bytes, kind: str, where: str) -> Any:
-    """A message of ROS from its bytes, or an error that names its topic.
-
-    Args:
-        read: makes a message of bytes and the name of a type.
-        raw: the bytes.
-        kind: name of the type.
-        where: begins the line of an error.
-
-    Raises:
-        InvalidMessage: the bytes are no message of that type.
-    """
-    try:
-        return read(raw, kind)
-    except Exception as error:  # whatever broken bytes provoke
-        raise InvalidMessage(where, f"holds {len(raw)} bytes that are no {kind} ({reason(error)})") from error
-
-
-def ros_header_ns(raw: bytes, encoding: str, where: str) -> int:
-    """Stamp (ns) of a message that begins with a header, without reading the rest.
-
-    Args:
-        raw: the message, at least its first bytes.
-        encoding: "cdr" or "ros1".
-        where: begins the line of an error.
-
-    Raises:
-        InvalidMessage: there are too few bytes, or they begin with no header.
-    """
-    try:
-        if encoding == "cdr":
-            order = "<" if raw[1] & 1 else ">"
-            seconds, nanoseconds, letters = struct.unpack_from(f"{order}iII", raw, 4)
-        else:
-            seconds, nanoseconds, letters = struct.unpack_from("<III", raw, 4)
-    except (struct.error, IndexError) as error:
-        raise InvalidMessage(where, f"holds {len(raw)} bytes, expected a message with a header") from error
-    if letters > LONGEST_FRAME:
-        raise InvalidMessage(where, f"has a frame of {letters} letters, expected at most {LONGEST_FRAME}")
-    return int(seconds) * NANOSECONDS + int(nanoseconds)
-
-
-def _stamp_of(read: Any) -> int:
-    return stamp_ns(read())

@@ -30,13 +30,6 @@ from tests.fixtures.ros_bags import (
 )
 
 
-def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
-    r = Ros(1)
-    rows = [*scene(r), ("/tf_static", START_NS, r.info(START_NS, "color", COLOR))]
-    with pytest.raises(DuagError, match=r"/tf_static holds .*TFMessage and .*CameraInfo, expected one type"):
-        registry.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
-
-
 @pytest.mark.parametrize("container", ["plain", "lz4"])
 def test_an_index_that_leads_to_another_topic_is_refused(tmp_path: Path, container: str) -> None:
     r = Ros(1)
