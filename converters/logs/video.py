@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.logs.entries import Entry, raw_image
+from duagc.converters.logs.entries import Entry, InvalidMessage, raw_image
 
 _CODECS = {"264": "h264", "265": "h265", "hevc": "h265", "vp9": "vp9"}
 """By what the name of a format or of an encoder holds ("h264", "libx264", "hevc_nvenc")."""
@@ -44,7 +44,8 @@ def is_video(kind: str) -> bool:
 def images(packets: Iterator[Entry]) -> Iterator[Entry]:
     """The same messages, read as raw images of ROS.
 
-    What cannot be decoded is read as a compressed image of a format that no decoder knows, which says why.
+    What cannot be decoded is read as a compressed image of a format that no decoder knows, which says why. A message
+    that is no packet stays what it is; packets after it cannot be decoded, up to a picture that needs no other.
 
     Args:
         packets: messages that `is_video`, of one topic, in order of recording.
@@ -53,11 +54,15 @@ def images(packets: Iterator[Entry]) -> Iterator[Entry]:
     before: list[Entry] = []
     parameters = b""
     for packet in packets:
-        if _begins(packet):
+        is_packet = _is_packet(packet)
+        if not is_packet or _begins(packet):
             yield from _Part(part, before, parameters).entries()
             parameters = b"".join(_parameters(p) for p in part) or parameters
-            part, before = [], part
-        part.append(packet)
+            part, before = [], part if part and is_packet and _begins(part[0]) else []
+        if is_packet:
+            part.append(packet)
+        else:
+            yield packet
     yield from _Part(part, before, parameters).entries()
 
 
@@ -106,7 +111,7 @@ class _Part:
         if _codec(self._packets[0].read()) is None:
             return "that is not read"
         if not self._decoded or not _begins(self._decoded[0]):
-            return "before the first picture that needs no other"
+            return "before a picture that needs no other"
         film, count = self._opened(), 0
         while film.isOpened() and film.grab():
             count += 1
@@ -145,6 +150,16 @@ class _Part:
         numbers = struct.pack("<HHIII", 0, 0, 30, 1, len(found))  # size and rate, which nobody reads
         head = b"DKIF" + struct.pack("<HH", 0, 32) + b"VP90" + numbers + bytes(4)
         return head + b"".join(struct.pack("<IQ", len(data), k) + data for k, data in enumerate(found))
+
+
+def _is_packet(entry: Entry) -> bool:
+    """Whether a message is what its topic says."""
+    try:
+        entry.read()
+        entry.header_ns()
+    except InvalidMessage:
+        return False
+    return True
 
 
 def _begins(entry: Entry) -> bool:

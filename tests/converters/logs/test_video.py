@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,13 +20,13 @@ from duagc.converters import registry
 from duagc.converters.layouts.ros_images import is_unusable
 from duagc.converters.logs import open_log
 from duagc.converters.logs.definitions import OF_DRIVERS
-from duagc.converters.logs.entries import Entry, stamp_ns
+from duagc.converters.logs.entries import Entry, InvalidMessage, stamp_ns
 from duagc.converters.logs.video import images
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import open_rgbd
-from tests.fixtures import h265_packets
+from tests.fixtures import foreign_mcap, h265_packets
 from tests.fixtures.foreign_mcap import Row, encoded, write
-from tests.fixtures.ros_bags import Ros, scene
+from tests.fixtures.ros_bags import STEP_NS, Ros, scene
 from tests.fixtures.video_packets import Planes, packets, planes_of, shown
 
 COLOR = "/camera/color/image_raw"
@@ -153,7 +155,7 @@ def test_what_comes_before_the_first_whole_picture_is_unusable(film: list[NDArra
     planes = [planes_of(image) for image in film]
     found = list(images(iter(entries_of(packets(planes, 4)[1:]))))
     assert [is_unusable(entry.read()) for entry in found] == [True] * 3 + [False] * 3
-    assert found[0].read().format == "h264 before the first picture that needs no other"
+    assert found[0].read().format == "h264 before a picture that needs no other"
 
 
 def test_a_part_that_lost_a_picture_is_unusable_and_the_next_is_not(film: list[NDArray[np.uint8]]) -> None:
@@ -162,6 +164,67 @@ def test_a_part_that_lost_a_picture_is_unusable_and_the_next_is_not(film: list[N
     found = list(images(iter(entries_of(whole))))
     assert [is_unusable(entry.read()) for entry in found] == [True] * 4 + [False] * 3
     assert found[0].read().format == "h264 with 3 pictures in 4 packets"
+
+
+@pytest.mark.parametrize("place", [0, 2, 4, 6])
+def test_a_message_that_is_no_packet_costs_what_needs_it(film: list[NDArray[np.uint8]], place: int) -> None:
+    planes = [planes_of(image) for image in film]
+    entries = entries_of(packets(planes, 4))
+
+    def refuse() -> None:
+        raise InvalidMessage("log: /video", "holds 3 bytes that are no packet")
+
+    entries[place] = replace(entries[place], read=refuse, header_ns=refuse)
+    found = list(images(iter(entries)))
+    assert [entry.log_ns for entry in found] == list(range(7))
+    needing = [k for k in range(7) if k // 4 == place // 4 and k > place]
+    for index, entry in enumerate(found):
+        if index == place:
+            with pytest.raises(InvalidMessage, match="no packet"):
+                entry.read()
+        elif index in needing:
+            assert entry.read().format == "h264 before a picture that needs no other"
+        else:
+            assert np.abs(picture(entry.read()) - shown(planes[index])).max() <= NEAR, index
+
+
+@pytest.mark.parametrize("kind", ["protobuf", "json", "cdr"])
+def test_a_log_with_a_packet_that_is_none_is_converted(tmp_path: Path, kind: str) -> None:
+    r = Ros(2)
+    rows = scene(r)
+    film = packets([planes_of(color) for color in colors_of(rows)], 2)
+    name = "FFMPEGPacket" if kind == "cdr" else kind
+    video = as_video(rows, film, r, name)
+
+    def cut(message: Any, *how: Any) -> Any:
+        parts = encoded(message, *how)
+        is_third = "video" in parts[0].lower() or "FFMPEG" in parts[0]
+        cut.seen += is_third  # type: ignore[attr-defined]
+        return (*parts[:3], parts[3][:7]) if is_third and cut.seen == 3 else parts  # type: ignore[attr-defined]
+
+    cut.seen = 0  # type: ignore[attr-defined]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(foreign_mcap, "encoded", cut)
+        log = write(tmp_path / "log.mcap", video, kind, r)
+    registry.convert("ros", log, tmp_path / "rec")
+    found = json.loads((tmp_path / "rec" / "recording.json").read_text())
+    at = next(t for topic, t, _ in video[::-1] if topic.endswith("video")) - STEP_NS
+    start = f"alpha: /camera/color/video: 1 of 4 messages left out; the first, recorded at {at / 1e9:.3f} s, holds 7 "
+    assert [warning for warning in found["warnings"] if warning.startswith(start)], found["warnings"]
+    assert found["robots"]["alpha"]["frames"] == 2  # the fourth needs the third
+
+
+def test_h265_that_begins_between_pictures_that_need_none(film: list[NDArray[np.uint8]]) -> None:
+    """What needs pictures before the beginning is not shown; what follows the first one that needs none is."""
+    planes = [planes_of(image) for image in (*film, *film[::-1])]
+    coded = h265_packets.open_packets(planes, 4)
+    data, order = [data for _, data in coded], [place for place, _ in coded]
+    found = list(images(iter(entries_of(data[2:], "hevc", order[2:]))))
+    needed = [packet.read() for packet in found]
+    assert [is_unusable(message) for message in needed] == [True, True, False, True, *[False] * 8]
+    for index in (2, 4, 6, 7, 11):
+        shows = order[2 + index]
+        assert np.abs(picture(needed[index]) - shown(planes[shows])).max() <= NEAR, index
 
 
 def test_pictures_are_shown_in_order_of_time(film: list[NDArray[np.uint8]]) -> None:
@@ -232,7 +295,7 @@ def test_h265_may_begin_with_a_picture_that_others_may_follow_into() -> None:
     ]
     found = [entry.read().format for entry in images(iter(entries_of(film, "hevc_nvenc")))]
     assert found == [
-        "hevc_nvenc before the first picture that needs no other",
+        "hevc_nvenc before a picture that needs no other",
         *["hevc_nvenc with 0 pictures in 2 packets"] * 4,
     ]
 
