@@ -82,7 +82,7 @@ class Clip:
     """What one robot saw.
 
     Attributes:
-        label: in the dataset.
+        label: in the dataset; of messages and recording.json, not of the log.
         camera: of the depth images, and of the color images unless `color_camera` is given; then color is
             resampled into `camera` (same place, same axes).
         depth_scale: meters per unit.
@@ -193,7 +193,8 @@ def write(
     with RecordingWriter(out, "", source, dataset, parameters=dict(parameters), force=force) as recording:
         recording.warnings += warnings
         for name, clip in zip(names or robot_names(len(clips)), clips, strict=True):
-            sensors = {"part": clip.label, **clip.sensors}
+            # names of folders are no content: clips that were renamed make logs of the same digest
+            sensors = {"part": "", **clip.sensors}
             greatest, share = _unmeasured(clip)
             if greatest:
                 clip = replace(clip, no_depth=(*clip.no_depth, greatest))
