@@ -208,7 +208,7 @@ def _check_out(out: Path, force: bool, kind: FolderKind) -> None:
     if not out.exists():
         return
     if not force:
-        raise DuagError(f"{out}: exists already; choose another --out or give --force")
+        raise DuagError(f"{out}: exists already; choose another path or give --force")
     if not out.is_dir() or (any(out.iterdir()) and not any((out / mark).is_file() for mark in kind.marks)):
         raise DuagError(f"{out}: is not {kind.name}, expected one; --force replaces nothing else")
     for path in sorted(out.rglob("*")):

@@ -47,6 +47,17 @@ def check_file(path: Path, expected: str, largest: int | None = None) -> int:
     return size
 
 
+def kind_of_path(path: Path) -> str:
+    """What is at a path, for the line of an error: "a file", "a folder" or "no such file or folder".
+
+    Args:
+        path: of anything; need not exist.
+    """
+    if path.is_dir():
+        return "a folder"
+    return "a file" if path.exists() else "no such file or folder"
+
+
 def read_bytes(path: Path, expected: str) -> bytes:
     """The bytes of a file.
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import check_file, read_json, read_toml
+from duagc.pipeline.base.files import check_file, kind_of_path, read_json, read_toml
 from duagc.pipeline.comparison.fields import Unequal, unequal
 from duagc.pipeline.comparison.recordings import description_of, files_of, made_otherwise, points_of
 from duagc.pipeline.comparison.summary import ORDER, libraries_of, stage_of
@@ -135,7 +135,8 @@ def _kind(path: Path) -> str:
         return "a recording"
     if (path / "robots").is_dir():
         return "a run"
-    raise DuagError(f"{path}: expected a log, a recording (recording.json) or a run (robots/)")
+    found = kind_of_path(path)
+    raise DuagError(f"{path}: {found}, expected a log, a recording (recording.json) or a run (robots/)")
 
 
 def _files(path: Path, kind: str) -> list[str]:

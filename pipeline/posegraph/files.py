@@ -125,7 +125,9 @@ def _read(path: Path) -> tuple[Edges, int, tuple[str, ...]]:
         return _merge([read_kimera(table) for table in tables]), len(tables), ()
     files = sorted(path.glob("*.g2o"), key=_natural)
     if not files:
-        raise DuagError(f"{path}: neither *.g2o nor robot*/measurements.csv in this folder")
+        raise DuagError(
+            f"{path}: found neither *.g2o nor robot*/measurements.csv, expected a team's pose graphs"
+        )
     graphs = [read_g2o(file) for file in files]
     if len(files) == 1:
         return _merge(graphs), 1, ()

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.files import kind_of_path, read_text
 from duagc.pipeline.recording import Recording, content_digest
 
 RESULT_SUFFIXES = (".mcap", ".ply", ".tum")
@@ -70,7 +70,8 @@ def digest(path: str | Path) -> str:
         names = result_files(path)
         _check_complete(path)
     else:
-        raise DuagError(f"{path}: expected a log, a recording (recording.json) or a run (robots/)")
+        found = kind_of_path(path)
+        raise DuagError(f"{path}: {found}, expected a log, a recording (recording.json) or a run (robots/)")
     whole = hashlib.sha256()
     for name in names:
         whole.update(f"{name.as_posix()} {digest_file(path / name)}\n".encode())

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.files import encode_jpeg, new_file
+from duagc.pipeline.base.files import encode_jpeg, kind_of_path, new_file
 from duagc.pipeline.messages import camera_frame
 from duagc.pipeline.recording import RECORDING_FILE, Recording, open_rgbd, read_log
 from duagc.pipeline.recording.color_images import ColorImages
@@ -87,7 +87,8 @@ def _as_rrd(path: Path, folder: Path, recording: Path | None) -> Path:
     if path.suffix == ".mcap" and path.is_file():
         return recording_to_rrd([path], out)
     raise DuagError(
-        f"{path}: expected a run (robots/), a recording ({RECORDING_FILE}), an .mcap or an .rrd file"
+        f"{path}: {kind_of_path(path)}, expected a run (robots/), a recording ({RECORDING_FILE}), an .mcap or an "
+        ".rrd file"
     )
 
 

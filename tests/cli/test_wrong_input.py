@@ -9,8 +9,10 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
+from duagc.pipeline.comparison.compare import compare
 from duagc.pipeline.experiments.carry_out import read_result
-from duagc.pipeline.runs.digest import digest_file
+from duagc.pipeline.runs.digest import digest, digest_file
+from duagc.pipeline.viewing.rerun_view import view
 from tests.fixtures import fake_run
 from tests.fixtures.commands import assert_one_line, duagc_here
 
@@ -136,6 +138,21 @@ def test_results_of_experiments_are_looked_at(tmp_path: Path) -> None:
         path.write_text(json.dumps(RESULT | change))
         with pytest.raises(DuagError, match="is no result of an experiment"):
             read_result(path)
+
+
+@pytest.mark.parametrize("kind", ["a file", "a folder", "no such file or folder"])
+def test_what_is_no_run_is_said(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "it"
+    if kind == "a folder":
+        path.mkdir()
+    elif kind == "a file":
+        path.write_text("text")
+    with pytest.raises(DuagError, match=f"it: {kind}, expected a run"):
+        view(path, save=tmp_path / "made.rrd")
+    if kind != "a file":  # of which `digest` is that of its bytes
+        for refused in (lambda: digest(path), lambda: compare(path, path)):
+            with pytest.raises(DuagError, match=f"it: {kind}, expected a log, a recording"):
+                refused()
 
 
 def test_a_file_needs_a_name() -> None:
