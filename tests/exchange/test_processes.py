@@ -55,7 +55,8 @@ def carry(pipes: dict[str, Connection]) -> None:
 
 
 def test_agents_in_separate_processes_end_the_same_bit_for_bit(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])  # imports once, and nothing else, for the three of them
     pipes: dict[str, Any] = {}
     processes = []
     for place, name in enumerate(NAMES):
