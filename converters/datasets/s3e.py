@@ -8,7 +8,7 @@ millimeters, no rectification; the cameras are rectified here, and that is teste
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,7 +36,7 @@ from duagc.converters.layouts.ros_points import VELODYNE, UnusableSweep
 from duagc.converters.layouts.s3e_layout import Fixes, S3eCalibration, read_fixes
 from duagc.converters.layouts.stereo import StereoOptions, StereoRig
 from duagc.converters.logs import open_log
-from duagc.converters.logs.entries import Entry
+from duagc.converters.logs.entries import Entry, InvalidMessage
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.gather import gathered, nearest
 from duagc.converters.logs.stamps import sound_stamps
@@ -165,7 +165,7 @@ class _Vehicle:
         self.frames = StereoFrames(self.rig, (c.left.width, c.left.height))
         T_camera_left = se3.from_rotation_translation(self.rig.R_rectified_left, np.zeros(3))
         self.T_camera_imu = T_camera_left @ c.T_left_imu
-        self.readings = imu_readings((entry.header_ns(), entry) for entry in log.entries(self.imu))
+        self.readings = imu_readings(log.entries(self.imu), log.invalid.left_out)
         motion = gyro(self.readings, self.T_camera_imu)
         self.lidar = LidarSource(T_camera_left @ c.T_left_lidar, settings.range_sigma_m, motion, VELODYNE)
         self.groups = self._groups()
@@ -180,6 +180,11 @@ class _Vehicle:
         """What the log says about its source."""
         depth = "stereo" if self.settings.depth == "stereo" else "lidar, drawn on reading"
         return {"part": self.left.split("/")[1], "depth": depth, "truth": "position", "imu": self.imu}
+
+    @property
+    def _used(self) -> set[str]:
+        """Topics that are converted."""
+        return {self.left, self.imu, self.right if self.settings.depth == "stereo" else self.points}
 
     def _groups(self) -> list[dict[str, int]]:
         """Topic -> time of what belongs together, for every frame in order."""
@@ -215,7 +220,9 @@ class _Vehicle:
         """Times of the left and right images and of the sweeps, increasing."""
         times: dict[str, list[int]] = {topic: [] for topic in (self.left, self.right, self.points)}
         for entry in self.log.entries(*times):
-            times[entry.topic].append(entry.header_ns())
+            with self.log.invalid.left_out(entry):
+                times[entry.topic].append(entry.header_ns())
+        self.log.invalid.check(self._used)
         return [
             sound_stamps(self.log.name, topic, stamps, self.warnings, remedy="") if stamps else []
             for topic, stamps in times.items()
@@ -268,6 +275,8 @@ class _Vehicle:
                 empty += int((depth == 0).sum())
                 if len(points):
                     scale.add(points, depth)
+        self.log.invalid.check(self._used)
+        self.warnings += self.log.invalid.words({self.left, self.right, self.points, self.imu})
         left_out = [*broken, *swept] if self.settings.depth == "lidar" else broken
         if len(left_out) == len(self.groups):
             raise left_out[0]
@@ -288,9 +297,9 @@ class _Vehicle:
         self, parts: Mapping[str, Entry]
     ) -> tuple[bytes, NDArray[np.uint16] | None, NDArray[np.float32] | None]:
         """PNG of the left image, and depth with its standard deviation (m), [h, w]; none of a LiDAR."""
-        left = parts[self.left].read()
+        left = self._read(parts[self.left])
         if self.settings.depth == "stereo":
-            return self.frames.frame(left, parts[self.right].read(), self.where)
+            return self.frames.frame(left, self._read(parts[self.right]), self.where)
         color = self.rig.rectify_left(self.frames.sized(decoded(left, self.where), self.where))
         return encode_png(color), None, None
 
@@ -299,13 +308,35 @@ class _Vehicle:
         entry = parts.get(self.points)
         if entry is None:
             return np.zeros((0, 3))
-        return self.lidar.points(entry.read(), entry.header_ns(), at_ns, f"{self.log.name}: {self.points}")
+        sweep = self._read(entry, UnusableSweep)
+        return self.lidar.points(sweep, entry.header_ns(), at_ns, f"{self.log.name}: {self.points}")
+
+    def _read(self, entry: Entry, kind: type[UnusableImage] = UnusableImage) -> Any:
+        """A message; an error of this kind if it is none."""
+        try:
+            return entry.read()
+        except InvalidMessage as error:
+            self.log.invalid.add(entry, error)
+            raise kind(str(error)) from error
 
     def _check_rows(self) -> dict[str, Any]:
         """The test of the rectification on some pairs."""
         eyes = [{t: g[t] for t in (self.left, self.right)} for g in self.groups if self.right in g]
         chosen = [eyes[k] for k in sorted(spread(len(eyes), ROW_PAIRS))] if eyes else []
         found = gathered(self.log, chosen, lambda entry: entry.header_ns())
-        return self.frames.check_rows(
-            ((parts[self.left].read(), parts[self.right].read()) for parts in found), self.where
-        )
+        return self.frames.check_rows(self._pairs(found), self.where)
+
+    def _pairs(self, groups: Iterable[Mapping[str, Entry]]) -> Iterator[tuple[Any, Any]]:
+        """Left and right images of groups without those that are none; an error if all are."""
+        errors, sound = list[UnusableImage](), False
+        for parts in groups:
+            try:
+                pair = self._read(parts[self.left]), self._read(parts[self.right])
+            except UnusableImage as error:
+                errors.append(error)
+                continue
+            sound = True
+            yield pair
+        if errors and not sound:
+            self.log.invalid.check(self._used)
+            raise errors[0]

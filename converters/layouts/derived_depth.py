@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -210,19 +211,23 @@ class ScaleCheck:
         return float(np.median(ratios)) if len(ratios) > 100 else None
 
 
-def imu_readings(entries: Iterable[tuple[int, Entry]]) -> list[tuple[int, Array, Array]]:
+def imu_readings(
+    entries: Iterable[Entry], left_out: Callable[[Entry], AbstractContextManager[None]]
+) -> list[tuple[int, Array, Array]]:
     """Time (ns), rates (rad/s) and accelerations (m/s^2) of IMU messages, in order of time, each time once.
 
     Args:
-        entries: time (ns) and message of each, in any order; readings that are impossible are left out.
+        entries: the messages, in any order; readings that are impossible are left out.
+        left_out: given a message, leaves its block if the message is none.
     """
     found: dict[int, tuple[Array, Array]] = {}
-    for stamp_ns, entry in entries:
-        m = entry.read()
-        w, a = m.angular_velocity, m.linear_acceleration
-        reading = np.array([w.x, w.y, w.z], dtype=float), np.array([a.x, a.y, a.z], dtype=float)
-        if np.all(np.abs(reading) < IMPOSSIBLE):
-            found.setdefault(stamp_ns, reading)
+    for entry in entries:
+        with left_out(entry):
+            stamp_ns, m = entry.header_ns(), entry.read()
+            w, a = m.angular_velocity, m.linear_acceleration
+            reading = np.array([w.x, w.y, w.z], dtype=float), np.array([a.x, a.y, a.z], dtype=float)
+            if np.all(np.abs(reading) < IMPOSSIBLE):
+                found.setdefault(stamp_ns, reading)
     return [(stamp, *found[stamp]) for stamp in sorted(found)]
 
 

@@ -14,7 +14,15 @@ from duagc.converters.layouts.stereo import StereoOptions, StereoRig
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, open_rgbd
-from tests.fixtures.s3e import FRAMES, START_NS, STEP_NS, change_messages, write_bag, write_calibration
+from tests.fixtures.s3e import (
+    FRAMES,
+    START_NS,
+    STEP_NS,
+    change_messages,
+    cut_message,
+    write_bag,
+    write_calibration,
+)
 
 LEFT, RIGHT, IMU = "/Alpha/left_camera/compressed", "/Alpha/right_camera/compressed", "/Alpha/imu/data"
 POINTS = "/Alpha/velodyne_points"
@@ -79,6 +87,38 @@ def test_a_sweep_that_is_cut_short_costs_no_more_than_it_gives(
         assert [frame.stamp_ns for frame in log.frames()] == [START_NS + k * STEP_NS for k in kept]
     warning = f"alpha (Alpha): 1 frames {words}have a sweep that is cut short; left out"
     assert warning in recording.description["warnings"]
+
+
+@pytest.mark.parametrize("left", [5, 22])
+@pytest.mark.parametrize(
+    ("topic", "depth", "kept"),
+    [
+        (LEFT, "stereo", [0, 2]),
+        (RIGHT, "stereo", [0, 2]),
+        (POINTS, "stereo", range(FRAMES)),
+        (POINTS, "lidar", [0, 2]),
+        (IMU, "stereo", range(FRAMES)),
+    ],
+)
+def test_a_message_that_is_none_costs_itself(
+    sequence: Path, topic: str, depth: str, kept: Sequence[int], left: int
+) -> None:
+    """Its bytes end in its header, or behind it."""
+    count = cut_message(sequence, topic, 1, left)
+    recording = converted(sequence, f"depth={depth}")
+    with open_rgbd(recording.log("alpha")) as log:
+        assert [frame.stamp_ns for frame in log.frames()] == [START_NS + k * STEP_NS for k in kept]
+    start = f"alpha (Alpha): {topic}: 1 of {count} messages left out; the first, recorded at 16"
+    assert [text for text in recording.description["warnings"] if text.startswith(start)]
+
+
+@pytest.mark.parametrize("left", [5, 22])
+@pytest.mark.parametrize("topic", [LEFT, RIGHT, IMU])
+def test_most_of_a_topic_is_refused(sequence: Path, topic: str, left: int) -> None:
+    for number in range(30):
+        cut_message(sequence, topic, number, left)
+    with pytest.raises(DuagError, match=rf"{topic} holds {left} bytes.*; so it is with \d+ of its \d+ mess"):
+        converted(sequence)
 
 
 def test_sweeps_that_are_all_cut_short_are_refused(sequence: Path) -> None:
