@@ -22,7 +22,9 @@ def inverse_or_zero(values: NDArray[Any]) -> NDArray[Any]:
     return np.where(known, one / np.where(known, values, one), values.dtype.type(0))
 
 
-def inverse_depth_sigma(inverse_depth: NDArray[Any], sigma_m: NDArray[Any] | None = None) -> float:
+def inverse_depth_sigma(
+    inverse_depth: NDArray[Any], sigma_m: NDArray[Any] | None = None, *, stride: int = 1
+) -> float:
     """Standard deviation of the inverse depth of the farther half of the known pixels, 1/m; 0 where too few are known.
 
     By its second differences along rows and columns, which are 0 on planes, or as stated, whichever is larger. It is
@@ -32,15 +34,16 @@ def inverse_depth_sigma(inverse_depth: NDArray[Any], sigma_m: NDArray[Any] | Non
     Args:
         inverse_depth: [h, w], 1/m, 0 = unknown.
         sigma_m: [h, w], standard deviation of the depth where it is known, meters; None: not stated.
+        stride: pixels from one row, and from one column, along which differences are taken to the next.
     """
-    known = inverse_depth[inverse_depth > 0]
+    sampled = inverse_depth[::stride, ::stride]
+    known = sampled[sampled > 0]
     if not len(known):
         return 0.0
     half = median(known)
     far = (inverse_depth > 0) & (inverse_depth <= half)
-    differences = np.concatenate(
-        [_second_differences(inverse_depth, far), _second_differences(inverse_depth.T, far.T)]
-    )
+    lines = (inverse_depth[::stride], far[::stride]), (inverse_depth.T[::stride], far.T[::stride])
+    differences = np.concatenate([_second_differences(*each) for each in lines])
     noise = mad_sigma(differences) / np.sqrt(6) if len(differences) else 0.0
     stated = 0.0 if sigma_m is None else median((sigma_m * np.square(inverse_depth))[far])
     return float(max(noise, stated))

@@ -66,6 +66,7 @@ def halved(
     sigma_m: Image | None = None,
     half_mask: Mask | None = None,
     *,
+    chance: float = 0.0,
     isa: str = "auto",
 ) -> tuple[Image, Image, Image | None]:
     """The next coarser images: gray, inverse depth, sigma.
@@ -75,6 +76,7 @@ def halved(
         inverse_depth: [h, w], 1/m, 0 where unknown.
         sigma_m: [h, w], meters; None: not known.
         half_mask: bool [h // 2, w // 2], pixels that may be used; None: all.
+        chance: by which two inverse depths of one surface differ at most by their noise, 1/m.
         isa: instruction set, as of `Rasterizer`.
     """
     shape = gray.shape[0] // 2, gray.shape[1] // 2
@@ -83,7 +85,7 @@ def halved(
     half_sigma = NOTHING if sigma_m is None else _empty(*shape)
     images = floats_of("gray", gray, gray.shape), floats_of("inverse_depth", inverse_depth, gray.shape)
     out = half_gray, half_depth, half_sigma
-    _raster.halve(isa, *images, sigma, _bytes(half_mask, shape), *out)
+    _raster.halve(isa, *images, sigma, _bytes(half_mask, shape), chance, *out)
     return half_gray, half_depth, None if sigma_m is None else half_sigma
 
 

@@ -51,7 +51,12 @@ def inverse_depth_of(
 
 
 def halved(
-    gray: Image, inverse_depth: Image, sigma_m: Image | None = None, half_mask: masks.Mask | None = None
+    gray: Image,
+    inverse_depth: Image,
+    sigma_m: Image | None = None,
+    half_mask: masks.Mask | None = None,
+    *,
+    chance: float = 0.0,
 ) -> tuple[Image, Image, Image | None]:
     """The images of `Level.halved`: gray, inverse depth, sigma.
 
@@ -60,9 +65,12 @@ def halved(
         inverse_depth: [h, w], 1/m, 0 where unknown.
         sigma_m: [h, w], meters; None: not known.
         half_mask: bool [h // 2, w // 2], pixels that may be used; None: all.
+        chance: by which two inverse depths of one surface differ at most by their noise, 1/m.
     """
     blocks = _blocks(inverse_depth)
-    members = blocks > blocks.max(axis=0) * (1 - SAME_SURFACE)
+    nearest = blocks.max(axis=0)
+    least = np.minimum(nearest * (1 - SAME_SURFACE), nearest - np.float32(chance))
+    members = blocks > np.maximum(least, np.float32(0))
     count = members.sum(axis=0, dtype=np.float32)
     total = np.where(members, blocks, np.float32(0)).sum(axis=0)
     known = (total > 0) & (count >= 2)

@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.geometry.inverse_depth import inverse_depth_sigma
+from duagc.pipeline.geometry.inverse_depth import chance_difference, inverse_depth_sigma
 from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
 from duagc.pipeline.geometry.scattered_holes import without_scattered_holes
 from duagc.pipeline.kernels import pyramid as compiled
 from duagc.pipeline.registration.wide_surfaces import WideSurfaces
 
 Image = NDArray[Any]
+
+SAMPLED_PX = 40  # rows and columns, about, along which noise from pixel to pixel is measured
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,11 @@ class Level:
         return inverse_depth_sigma(self.inverse_depth, self.depth_sigma_m)
 
     @cached_property
+    def sigma_of_neighbors(self) -> float:
+        """Standard deviation of the inverse depth of what is far, as far as neighbors do not share it, 1/m."""
+        return inverse_depth_sigma(self.inverse_depth, stride=max(1, self.camera.width // SAMPLED_PX))
+
+    @cached_property
     def normals(self) -> Image:
         """Unit surface normals in the camera frame that face the camera, [h, w, 3]; zero where unknown.
 
@@ -110,11 +117,15 @@ class Level:
         """The next coarser level: blocks of 2x2 pixels become one.
 
         The gray value is the mean. The inverse depth is the mean over the nearest surface in the block (members
-        within 5 % of the nearest pixel), unknown if fewer than two pixels show it; sigma is their mean too, as errors
-        of neighbors are much the same. A block may be used if all its pixels may.
+        within 5 % of the nearest pixel, or within what noise from pixel to pixel explains), unknown if fewer than two
+        pixels show it; sigma is their mean too, as errors of neighbors are much the same. A block may be used if all
+        its pixels may.
         """
         mask = None if self.mask is None else masks.halved(self.mask)
-        gray, inverse_depth, sigma = compiled.halved(self.gray, self.inverse_depth, self.depth_sigma_m, mask)
+        chance = chance_difference(self.sigma_of_neighbors, self.sigma_of_neighbors)
+        gray, inverse_depth, sigma = compiled.halved(
+            self.gray, self.inverse_depth, self.depth_sigma_m, mask, chance=chance
+        )
         return Level(
             self.camera.halved(),
             gray,
@@ -137,8 +148,12 @@ class RgbdPyramid:
 
     @property
     def inverse_depth_sigma(self) -> float:
-        """Standard deviation of the inverse depth of what is far, in the coarsest image, 1/m."""
-        return self.levels[-1].inverse_depth_sigma
+        """Standard deviation of the inverse depth of what is far, 1/m.
+
+        By the image that shows most of it: coarse ones average what neighbors do not share, fine ones hide the rest.
+        """
+        *finer, coarsest = self.levels
+        return max([coarsest.inverse_depth_sigma, *(level.sigma_of_neighbors for level in finer)])
 
     @cached_property
     def wide_surfaces(self) -> WideSurfaces | None:

@@ -52,7 +52,7 @@ class WideSurfaces:
             finest: inverse depth [h, w], 1/m, 0 = unknown.
             coarsest: the same of the coarsest image, [h // factor, w // factor].
             factor: between their sizes.
-            sigma: standard deviation of the inverse depth in the coarsest image, 1/m.
+            sigma: standard deviation of the inverse depth of single pixels, 1/m.
         """
         chance = chance_difference(sigma, sigma)
         below = chance / TELLS_STEPS

@@ -32,6 +32,13 @@ def test_noise_is_that_of_surfaces_whatever_stands_on_them() -> None:
         assert inverse_depth_sigma(found) == pytest.approx(noise, rel=0.1)
 
 
+def test_some_rows_and_columns_show_the_noise_from_pixel_to_pixel() -> None:
+    for noise in (1e-3, 5e-3):
+        assert inverse_depth_sigma(ground(noise), stride=4) == pytest.approx(noise, rel=0.1)
+    smooth = np.repeat(np.repeat(ground(5e-3)[::4, ::4], 4, axis=0), 4, axis=1)
+    assert inverse_depth_sigma(smooth, stride=4) < 1e-6
+
+
 def test_noise_is_that_of_what_is_far() -> None:
     near, far = ground(0.02), ground(1e-3)
     whole = np.where(np.arange(60)[:, None] < 32, far, near)

@@ -37,11 +37,17 @@ NO_INLINE static void halve_gray(const float* __restrict top, const float* __res
 
 ALWAYS_INLINE inline float larger(float a, float b) { return a > b ? a : b; }
 
+// Inverse depth beyond which the nearest of four is on the same surface: within 5 %, or within what noise explains.
+ALWAYS_INLINE inline float least_of_surface(float a, float b, float c, float d, float chance) {
+    const float nearest = larger(larger(a, b), larger(c, d)), by_share = nearest * (1.0f - SAME_SURFACE), by_noise = nearest - chance;
+    return larger(by_share < by_noise ? by_share : by_noise, 0.0f);
+}
+
 // The mean of those of the four that show the nearest surface, and how many they are.
-NO_INLINE static void halve_depth(const float* __restrict top, const float* __restrict bottom, int width, float* __restrict out) {
+NO_INLINE static void halve_depth(const float* __restrict top, const float* __restrict bottom, int width, float chance, float* __restrict out) {
     for (int i = 0; i < width; i++) {
         const float a = top[2 * i], b = top[2 * i + 1], c = bottom[2 * i], d = bottom[2 * i + 1];
-        const float least = larger(larger(a, b), larger(c, d)) * (1.0f - SAME_SURFACE);
+        const float least = least_of_surface(a, b, c, d, chance);
         const float total = (a > least ? a : 0.0f) + (b > least ? b : 0.0f) + (c > least ? c : 0.0f) + (d > least ? d : 0.0f);
         const float count = (a > least ? 1.0f : 0.0f) + (b > least ? 1.0f : 0.0f) + (c > least ? 1.0f : 0.0f) + (d > least ? 1.0f : 0.0f);
         const float mean = total / larger(count, 1.0f);
@@ -49,10 +55,11 @@ NO_INLINE static void halve_depth(const float* __restrict top, const float* __re
     }
 }
 NO_INLINE static void halve_sigma(const float* __restrict top, const float* __restrict bottom, const float* __restrict sigma_top,
-                                  const float* __restrict sigma_bottom, const float* __restrict halved, int width, float* __restrict out) {
+                                  const float* __restrict sigma_bottom, const float* __restrict halved, int width, float chance,
+                                  float* __restrict out) {
     for (int i = 0; i < width; i++) {
         const float a = top[2 * i], b = top[2 * i + 1], c = bottom[2 * i], d = bottom[2 * i + 1];
-        const float least = larger(larger(a, b), larger(c, d)) * (1.0f - SAME_SURFACE);
+        const float least = least_of_surface(a, b, c, d, chance);
         const float total = (a > least ? sigma_top[2 * i] : 0.0f) + (b > least ? sigma_top[2 * i + 1] : 0.0f) +
                             (c > least ? sigma_bottom[2 * i] : 0.0f) + (d > least ? sigma_bottom[2 * i + 1] : 0.0f);
         const float count = (a > least ? 1.0f : 0.0f) + (b > least ? 1.0f : 0.0f) + (c > least ? 1.0f : 0.0f) + (d > least ? 1.0f : 0.0f);
@@ -61,18 +68,19 @@ NO_INLINE static void halve_sigma(const float* __restrict top, const float* __re
     }
 }
 
-static void halve(const LevelImages& level, const HalvedImages& out) {
+// Members of a block whose inverse depths differ by `chance` at most (1/m) are of one surface, as those within 5 % are.
+static void halve(const LevelImages& level, float chance, const HalvedImages& out) {
     const size_t from = static_cast<size_t>(level.width), to = from / 2;
     const int width = level.width / 2;
     for (size_t row = 0; row < static_cast<size_t>(level.height / 2); row++) {
         const size_t top = 2 * row * from, bottom = top + from, at = row * to;
         halve_gray(level.gray + top, level.gray + bottom, width, out.gray + at);
-        halve_depth(level.inverse_depth + top, level.inverse_depth + bottom, width, out.inverse_depth + at);
+        halve_depth(level.inverse_depth + top, level.inverse_depth + bottom, width, chance, out.inverse_depth + at);
         if (level.mask)
             for (size_t i = 0; i < to; i++) out.inverse_depth[at + i] = level.mask[at + i] ? out.inverse_depth[at + i] : 0.0f;
         if (out.depth_sigma)
             halve_sigma(level.inverse_depth + top, level.inverse_depth + bottom, level.depth_sigma + top, level.depth_sigma + bottom,
-                        out.inverse_depth + at, width, out.depth_sigma + at);
+                        out.inverse_depth + at, width, chance, out.depth_sigma + at);
     }
 }
 

@@ -179,7 +179,7 @@ struct RegistrationKernels {
     void (*gray_of_floats)(const float* color, size_t pixels, float* gray);
     // mask and sigma may be null.
     void (*invert_depth)(const float* depth_m, const uint8_t* mask, const float* sigma, size_t pixels, float* inverse, float* known_sigma);
-    void (*halve)(const LevelImages&, const HalvedImages&);
+    void (*halve)(const LevelImages&, float, const HalvedImages&);
     void (*surface_normals)(const LevelImages&, const NormalPixels&, float* normals);
     // Inverse depth [h, w] (0: unknown), and columns and rows where it was looked up.
     void (*move_depth)(const MovedDepth&, Scratch<uint8_t>&, float* found, float* columns, float* rows);

@@ -109,10 +109,10 @@ static void invert_depth(const std::string& isa, const Inputs& depth_m, const By
     kernels_named(isa)->registration->invert_depth(depth_m.data(), data_or_null(mask), data_or_null(sigma), inverse.size(), inverse.data(), known_sigma.data());
 }
 static void halve(const std::string& isa, const Inputs& gray, const Inputs& inverse_depth, const Inputs& sigma, const Bytes& half_mask,
-                  const Floats& half_gray, const Floats& half_inverse_depth, const Floats& half_sigma) {
+                  float chance, const Floats& half_gray, const Floats& half_inverse_depth, const Floats& half_sigma) {
     const LevelImages level = {static_cast<int>(gray.shape(1)), static_cast<int>(gray.shape(0)), gray.data(), inverse_depth.data(),
                                data_or_null(sigma), data_or_null(half_mask)};
-    kernels_named(isa)->registration->halve(level, {half_gray.data(), half_inverse_depth.data(), data_or_null(half_sigma)});
+    kernels_named(isa)->registration->halve(level, chance, {half_gray.data(), half_inverse_depth.data(), data_or_null(half_sigma)});
 }
 static void surface_normals(const std::string& isa, const Inputs& inverse_depth, const Array<const int32_t>& rows,
                             const Array<const int32_t>& columns, const Inputs& camera, const Floats& normals) {
