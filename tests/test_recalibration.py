@@ -136,7 +136,7 @@ def test_calibrate_applies_what_it_found(tmp_path: Path, answers: Answers) -> No
     assert "alpha, bravo: calibrated" in text
     assert Recording(tmp_path / "out").name == "out"
     assert Recording(tmp_path / "out").description["calibration"]["recording"] == "rec"
-    again = "out: exists already; choose another --out or give --force"
+    again = "out: exists already; choose another path or give --force"
     with pytest.raises(DuagError, match=again):
         command("calibrate", folder, "--apply", tmp_path / "out")
     command("calibrate", folder, "--apply", tmp_path / "out", "--force", "--robot", "bravo")
