@@ -41,19 +41,20 @@ def inverse_depth_sigma(
     if not len(known):
         return 0.0
     half = median(known)
-    far = (inverse_depth > 0) & (inverse_depth <= half)
-    lines = (inverse_depth[::stride], far[::stride]), (inverse_depth.T[::stride], far.T[::stride])
-    differences = np.concatenate([_second_differences(*each) for each in lines])
+    lines = inverse_depth[::stride], np.ascontiguousarray(inverse_depth[:, ::stride].T)
+    differences = np.concatenate([_second_differences(each, half) for each in lines])
     noise = mad_sigma(differences) / np.sqrt(6) if len(differences) else 0.0
-    stated = 0.0 if sigma_m is None else median((sigma_m * np.square(inverse_depth))[far])
-    return float(max(noise, stated))
+    if sigma_m is None:
+        return float(noise)
+    far = (inverse_depth > 0) & (inverse_depth <= half)
+    return float(max(noise, median((sigma_m * np.square(inverse_depth))[far])))
 
 
-def _second_differences(inverse_depth: NDArray[Any], far: NDArray[np.bool_]) -> NDArray[Any]:
-    """Second differences [n] along rows, around pixels that are far and have known neighbors."""
-    before, after = inverse_depth[:, :-2], inverse_depth[:, 2:]
-    usable = far[:, 1:-1] & (before > 0) & (after > 0)
-    return (before - 2 * inverse_depth[:, 1:-1] + after)[usable]
+def _second_differences(inverse_depth: NDArray[Any], half: float) -> NDArray[Any]:
+    """Second differences [n] along rows, around pixels at most this near (1/m) that have known neighbors."""
+    before, at, after = inverse_depth[:, :-2], inverse_depth[:, 1:-1], inverse_depth[:, 2:]
+    usable = (at > 0) & (at <= half) & (before > 0) & (after > 0)
+    return np.asarray((before - 2 * at + after)[usable])
 
 
 def chance_difference(*inverse_depth_sigmas: float) -> float:
