@@ -165,7 +165,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
             f"no time stamps in the dataset: made from frame numbers at {settings.rate_hz} Hz"
         )
         for name, (_, frames), reference in zip(robot_names(len(parts)), parts, references, strict=True):
-            # no name of a folder, which is no content: sequences that were renamed make logs of the same digest
+            # no name of a folder, which is no content; empty, as of a sequence alone, whose digest stays what it was
             sensors = {"depth": "Kinect v1, registered to color by the converter", "sequence": ""}
             with recording.robot(name, settings.color_camera(), DEPTH_SCALE, sensors) as robot:
                 check = _write_robot(robot, frames, reference, settings, label=str(src))

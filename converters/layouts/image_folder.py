@@ -193,7 +193,7 @@ def write(
     with RecordingWriter(out, "", source, dataset, parameters=dict(parameters), force=force) as recording:
         recording.warnings += warnings
         for name, clip in zip(names or robot_names(len(clips)), clips, strict=True):
-            # names of folders are no content: clips that were renamed make logs of the same digest
+            # names of folders are no content; empty, as of a dataset of one clip, whose digest stays what it was
             sensors = {"part": "", **clip.sensors}
             greatest, share = _unmeasured(clip)
             if greatest:

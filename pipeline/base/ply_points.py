@@ -11,7 +11,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import MOST_OF_LINE, new_file
 
 _TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4", "uint": "<u4"}
-_MOST_DIGITS = 18  # of a number of vertices
+MOST_DIGITS = 18  # of a number of vertices; Python refuses to read thousands
 
 
 def read_points(path: Path) -> NDArray[np.void]:
@@ -32,7 +32,7 @@ def read_points(path: Path) -> NDArray[np.void]:
     elements = [words[1:] for words in lines if words[0] == "element"]
     properties = [words[1:] for words in lines if words[0] == "property"]
     counted = [words[:1] for words in elements] == [["vertex"]] and elements[0][-1].isdecimal()
-    if not counted or len(elements[0][-1]) > _MOST_DIGITS:
+    if not counted or len(elements[0][-1]) > MOST_DIGITS:
         raise DuagError(f"{path}: has elements {str(elements)[:MOST_OF_LINE]}, expected only 'vertex N'")
     names = [words[1] for words in properties if len(words) == 2 and words[0] in _TYPES]
     missing = {"x", "y", "z", "nx", "ny", "nz"} - set(names)

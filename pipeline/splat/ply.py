@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import MOST_OF_LINE, check_file, new_file
+from duagc.pipeline.base.ply_points import MOST_DIGITS
 from duagc.pipeline.splat.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814  # color = 0.5 + SH_DEGREE_0 * coefficient
@@ -23,7 +24,6 @@ PROPERTIES = (
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 _HEADER_LIMIT_BYTES = 1 << 16
-_MOST_DIGITS = 18  # of a number of Gaussians
 
 
 def write_ply(path: str | Path, gaussians: Gaussians) -> None:
@@ -143,7 +143,7 @@ def _head(data: bytes, path: Path) -> tuple[int, int]:
         raise DuagError(f"{path}: format is {lines[:1]}, expected binary_little_endian 1.0")
     words = lines[1].split()
     counted = len(words) == 3 and words[:2] == ["element", "vertex"] and words[2].isdigit()
-    if not counted or len(words[2]) > _MOST_DIGITS:
+    if not counted or len(words[2]) > MOST_DIGITS:
         raise DuagError(f"{path}: first element is '{lines[1][:MOST_OF_LINE]}', expected 'element vertex N'")
     if lines[2:] != [f"property float {name}" for name in PROPERTIES]:
         raise DuagError(f"{path}: properties differ from {' '.join(PROPERTIES)}, all float, in this order")
